@@ -17,10 +17,10 @@ from hapticbridge.lazy import lazy_exports
 if TYPE_CHECKING:
     from hapticbridge import theory as theory
     from hapticbridge.audit import AuditReport as AuditReport
-    from hapticbridge.bridge import Bridge as Bridge
     from hapticbridge.clock import RealClock as RealClock
     from hapticbridge.clock import SimulatedClock as SimulatedClock
     from hapticbridge.coupling import Coupling as Coupling
+    from hapticbridge.demand.guard import Limits as Limits
     from hapticbridge.device import Device as Device
     from hapticbridge.device import DeviceInfo as DeviceInfo
     from hapticbridge.device import open_device as open_device
@@ -31,18 +31,18 @@ if TYPE_CHECKING:
     from hapticbridge.errors import RecordingError as RecordingError
     from hapticbridge.errors import SafetyTrip as SafetyTrip
     from hapticbridge.errors import SceneError as SceneError
-    from hapticbridge.guard import Limits as Limits
-    from hapticbridge.hands import Grasp as Grasp
-    from hapticbridge.hands import GripAxis as GripAxis
-    from hapticbridge.options import BridgeOptions as BridgeOptions
-    from hapticbridge.options import Workspace as Workspace
-    from hapticbridge.record import SAMPLE_DTYPE as SAMPLE_DTYPE
-    from hapticbridge.record import TickFlag as TickFlag
+    from hapticbridge.kernel.record import SAMPLE_DTYPE as SAMPLE_DTYPE
+    from hapticbridge.kernel.record import TickFlag as TickFlag
     from hapticbridge.recording import read_recording as read_recording
     from hapticbridge.recording import repair as repair
+    from hapticbridge.run.bridge import Bridge as Bridge
+    from hapticbridge.run.hands import Grasp as Grasp
+    from hapticbridge.run.hands import GripAxis as GripAxis
+    from hapticbridge.run.options import BridgeOptions as BridgeOptions
+    from hapticbridge.run.options import Workspace as Workspace
+    from hapticbridge.run.summary import Summary as Summary
     from hapticbridge.scene import Scene as Scene
     from hapticbridge.scene import load_scene as load_scene
     from hapticbridge.scene import scene_names as scene_names
-    from hapticbridge.summary import Summary as Summary
 else:
     __getattr__, __dir__, __all__ = lazy_exports(__name__)

@@ -391,7 +391,7 @@ def _valid(kinds: Iterable[Any], own: Rule) -> str:
     words = {float: own.valid(), int: f"a whole number{whole}", bool: "True or False"}
     words |= {str: "a text that is not empty" if own.is_filled else "a text"}
     found = [
-        f"one of {choices(get_args(kind))}"
+        f"{'one of ' if get_args(kind)[1:] else ''}{choices(get_args(kind))}"
         if get_origin(kind) is Literal
         else words.get(kind) or f"a {(get_origin(kind) or kind).__name__}"
         for kind in kinds

@@ -229,7 +229,7 @@ class Confined:
         self._folder = tempfile.mkdtemp(prefix="hapticbridge-")
         self._until = time.monotonic() + PATIENCE + SHARE * (COMPILE_TIME + seconds)
         self._patience = self._until - time.monotonic()
-        self._child = 0
+        self._child, self._fresh = 0, fresh
         if sys.platform == "win32":
             return
         self._reading, writing = os.pipe()
@@ -268,6 +268,14 @@ class Confined:
             os.waitpid(self._child, 0)
         shutil.rmtree(self._folder, ignore_errors=True)
 
+    def _prepare(self) -> None:
+        """Prepares fresh work where it is done in this process."""
+        try:
+            if self._fresh is not None:
+                self._fresh.prepare()
+        except Exception as error:
+            raise ForeignSceneError(f"{self._what} {failure(error)[0]}") from None
+
     def result(self, hear: Callable[[Any], None] | None = None) -> Any:
         """Waits for the work; returns its result.
 
@@ -278,6 +286,7 @@ class Confined:
             ForeignSceneError: The child crashed, exceeded its limits, or made no progress.
         """
         if sys.platform == "win32":
+            self._prepare()
             return self._work(Unlimited(hear))
         room = LARGEST_ANSWER
         while frame := self._read(_FRAME.size):

@@ -34,23 +34,28 @@ suppress_warnings = ["myst.xref_missing", "docutils", "ref.python"]
 """
 
 INTERFACE = {
-    "Run": ("bridge.Bridge", "options.BridgeOptions", "options.Workspace", "guard.Limits"),
-    "Result": ("summary.Summary", "audit.audit", "audit.verdict.AuditReport"),
+    "Run": (
+        "run.bridge.Bridge",
+        "run.options.BridgeOptions",
+        "run.options.Workspace",
+        "demand.guard.Limits",
+    ),
+    "Result": ("run.summary.Summary", "audit.audit", "audit.verdict.AuditReport"),
     "Scene and coupling": ("scene.load.load_scene", "scene.scene.Scene", "coupling.Coupling"),
     "Device": (
         "device.base.Device",
         "device.base.DeviceInfo",
         "device.registry.open_device",
-        "record.TickFlag",
+        "kernel.record.TickFlag",
     ),
     "Clock": ("clock.RealClock", "clock.SimulatedClock"),
     "Recording": (
         "recording.reader.read_recording",
         "recording.reader.Recording",
         "recording.writer.repair",
-        "export.export",
+        "tools.export.export",
     ),
-    "Changes during a run": ("commands.Couple", "commands.Switch"),
+    "Changes during a run": ("run.commands.Couple", "run.commands.Switch"),
     "Many runs": ("sweep.sweep", "sweep.grid", "sweep.Table"),
     "Errors": (
         "errors.HapticBridgeError",
@@ -106,7 +111,7 @@ def write_pages() -> None:
         reference += [heading(subject, "-"), *map(directive, names)]
     (SOURCE / "python.rst").write_text("".join(reference), encoding="utf-8")
     commands = [f"## {name}\n```text\n{help_of(name)}```\n" for name in COMMANDS]
-    (SOURCE / "commands.md").write_text("# Commands\n" + "\n".join(commands), encoding="utf-8")
+    (SOURCE / "run.commands.md").write_text("# Commands\n" + "\n".join(commands), encoding="utf-8")
     contents = [
         toctree(kind, [f"guide/{topic.replace('-', '_')}" for topic in topics])
         for kind, topics in TOPICS.items()

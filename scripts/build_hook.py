@@ -31,7 +31,7 @@ class MachineCode(BuildHookInterface):  # type: ignore[misc]  # no types in an e
             return
         self._folder = TemporaryDirectory()
         environment = os.environ | {"NUMBA_CACHE_DIR": self._folder.name, "PYTHONPATH": self.root}
-        command = [sys.executable, "-m", "hapticbridge.programs"]
+        command = [sys.executable, "-m", "hapticbridge.run.programs"]
         subprocess.run(command, check=True, env=environment, cwd=self._folder.name)
         for path in Path(self._folder.name, "machine_code").glob("*.o"):
             path.chmod(0o644)

@@ -22,8 +22,8 @@ sys.path.insert(0, str(ROOT / "tests"))
 from chromium import Tab, browser  # noqa: E402 - beside the tests that use it, too
 
 from hapticbridge.audit import audit  # noqa: E402
-from hapticbridge.film import Shot, still  # noqa: E402
 from hapticbridge.recording import read_recording  # noqa: E402
+from hapticbridge.replay.film import Shot, still  # noqa: E402
 from hapticbridge.report import telling_time, write_report  # noqa: E402
 from hapticbridge.view import Address  # noqa: E402
 from hapticbridge.view.replay import Replay, Theatre  # noqa: E402

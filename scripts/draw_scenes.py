@@ -16,8 +16,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from hapticbridge import Bridge, Grasp, HapticBridgeError, SimulatedClock, load_scene
-from hapticbridge.hands import GripAxis
 from hapticbridge.kernel.codes import Grip
+from hapticbridge.run.hands import GripAxis
 from hapticbridge.scene import Scene, custom_numbers, custom_text, scene_names, scene_path
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.jit import compiled
+from hapticbridge.demand.methods import method_named, prepare
 from hapticbridge.kernel.codes import BAD_RESULT, CLUTCHED, FORCE_OFF, OK
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import shown_tick, whole_tick
-from hapticbridge.record import SAMPLE_DTYPE
-from hapticbridge.rendering import method_named, prepare
 from hapticbridge.scene import load_scene
 
 SCENES = (

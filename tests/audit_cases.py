@@ -16,17 +16,17 @@ from hapticbridge.audit import AuditReport, audit
 from hapticbridge.audit.energy import EnergyBalance, energy_balances
 from hapticbridge.audit.events import AuditState, RunEvents
 from hapticbridge.audit.wrench_limits import AuditedBlock
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device import AXES, Device, DeviceInfo
-from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import UNGUARDED, RunParameters
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording import Attachment, Recording, RecordingWriter
-from hapticbridge.run_description import SOURCE_PREFIX
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.description import SOURCE_PREFIX
+from hapticbridge.run.summary import Summary
 from hapticbridge.scene import Scene
-from hapticbridge.summary import Summary
 
 COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
+from hapticbridge.run.bridge import Bridge
 from hapticbridge.scene import Scene
 
 REST = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)

@@ -28,7 +28,7 @@ from hapticbridge.device.haply import opened as open_haply
 from hapticbridge.device.pid.device import PidDevice, open_pid
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
 from hapticbridge.identify import AxisFit, identify
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 
 PERIOD = 1e-3
 

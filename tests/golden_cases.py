@@ -31,13 +31,13 @@ from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.cli import main, terminal
-from hapticbridge.commands import Command, Couple, Reset, Switch
 from hapticbridge.device import force_dimension
 from hapticbridge.device.touch import servo
 from hapticbridge.device.transport import hid, usb
 from hapticbridge.device.wheel.evdev import Linux
 from hapticbridge.errors import CommandError
 from hapticbridge.recording import Recording
+from hapticbridge.run.commands import Command, Couple, Reset, Switch
 
 GOLDEN = Path(__file__).parent / "golden"
 RUNS, AUDITS, MACHINE = (GOLDEN / f"{name}.json" for name in ("runs", "audits", "machine"))

@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import IMPLICIT, prepare
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.rendering import IMPLICIT, prepare
+from hapticbridge.run.summary import Ledger
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.scene import has_rigid_contact
-from hapticbridge.summary import Ledger
 
 Array: TypeAlias = NDArray[np.float64]
 OnTick: TypeAlias = Callable[[int, Any], None]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.certificate import default_coupling
+from hapticbridge.demand.certificate import default_coupling
+from hapticbridge.demand.methods import default_method
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
-from hapticbridge.rendering import default_method
 
 T = 1e-3
 REACH, ANGLE = 0.03, np.radians(45.0)

@@ -8,7 +8,7 @@ import numpy as np
 from mcap.reader import SeekingReader
 from numpy.typing import NDArray
 
-from hapticbridge.record import TICK_DTYPE
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.recording import Attachment, RecordingWriter
 
 EPOCH = 1_700_000_000_000_000_000

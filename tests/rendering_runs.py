@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.methods import method_named, prepare, resolve_contact_stiffness
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.guard import Limits
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
-from hapticbridge.record import TICK_DTYPE
-from hapticbridge.rendering import method_named, prepare, resolve_contact_stiffness
 from hapticbridge.scene import Scene
 
 FREE_MASS = """

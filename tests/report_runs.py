@@ -13,12 +13,12 @@ from audit_cases import ScriptedDevice, recorded
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
-from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device import Device, Hand, SimulatedDevice
-from hapticbridge.guard import Limits
-from hapticbridge.record import TickFlag
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recording
+from hapticbridge.run.bridge import Bridge
 
 LOOSE = Coupling(2000, 0.2, 2, 5e-4)
 

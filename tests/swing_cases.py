@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.device import DEFAULT_HAND, Hand, Motion, SimulatedDevice
-from hapticbridge.record import TickFlag
+from hapticbridge.kernel.record import TickFlag
 
 GRIPS = {
     "fingers": Hand(mass=0.05, damping=2.0, stiffness=30.0),

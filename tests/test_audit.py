@@ -20,11 +20,11 @@ from hapticbridge.audit.events import RunEvents
 from hapticbridge.audit.motion import turn_between
 from hapticbridge.audit.wrench_limits import wrench_deviations
 from hapticbridge.coupling import Coupling
-from hapticbridge.guard import Limits
+from hapticbridge.demand.guard import Limits
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.options import Workspace
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.run_description import parameters_of
+from hapticbridge.run.description import parameters_of
+from hapticbridge.run.options import Workspace
 from hapticbridge.scene.load import scene_path
 
 

@@ -103,7 +103,7 @@ def test_links_lead_to_files_and_in_no_circle(runs: Path, tmp_path: Path) -> Non
 
 
 def test_the_margin_is_the_least_share_left() -> None:
-    report = AuditReport(Path("a"), "passive", "within slack", True, "", slack_share=0.25)
+    report = AuditReport(Path("a"), "passive", "within slack", "", slack_share=0.25)
     assert report.margin == 0.75
     for margin, verdict, expected in (
         (0.9, "passive", 0.75),
@@ -114,7 +114,7 @@ def test_the_margin_is_the_least_share_left() -> None:
     ):
         values: dict[str, Any] = {"damping_margin": margin, "verdict": verdict}
         assert AuditReport(**{**vars_of(report), **values}).margin == pytest.approx(expected)
-    assert np.isnan(AuditReport(Path("a"), "invalid", None, None, "").margin)
+    assert np.isnan(AuditReport(Path("a"), "invalid", None, "").margin)
 
 
 def vars_of(report: AuditReport) -> dict[str, Any]:

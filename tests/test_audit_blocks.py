@@ -12,11 +12,11 @@ from audit_cases import recorded, rewritten, tapped
 from recording_cases import random_rows, same, write
 
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice, device_for
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import open_recording, read_recording, reader
+from hapticbridge.run.bridge import Bridge
 from hapticbridge.scene import load_scene
 
 TOO_STIFF = Coupling(9000, 0.5, 1, 1e-3)

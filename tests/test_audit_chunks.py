@@ -24,8 +24,8 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from hapticbridge.audit import audit
-from hapticbridge.export import export
 from hapticbridge.recording import read_recording, repair
+from hapticbridge.tools.export import export
 
 
 @pytest.fixture(scope="module")

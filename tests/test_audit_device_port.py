@@ -15,12 +15,12 @@ from random_hands import random_motion
 from hapticbridge.audit import audit
 from hapticbridge.audit.energy import EnergyBalance, stored_in_springs
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.options import Workspace
 from hapticbridge.recording import read_recording
-from hapticbridge.run_description import parameters_of
+from hapticbridge.run.description import parameters_of
+from hapticbridge.run.options import Workspace
 
 T = 1e-3
 HOME = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)

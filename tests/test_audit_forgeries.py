@@ -29,17 +29,17 @@ from audit_cases import (
 from audit_cases import other_sheet as requested_sheet
 
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.bridge import Bridge
-from hapticbridge.commands import Couple, Reset
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import IDLE_FORCE, IDLE_TORQUE, Limits, guard_parameters_for
 from hapticbridge.device import DeviceInfo, SimulatedDevice
 from hapticbridge.errors import SafetyTrip
-from hapticbridge.guard import IDLE_FORCE, IDLE_TORQUE, Limits, guard_parameters_for
 from hapticbridge.kernel.parameters import UNGUARDED
-from hapticbridge.record import CLOCK_FIELDS, TickFlag
+from hapticbridge.kernel.record import CLOCK_FIELDS, TickFlag
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.rehearsal import start_handle
-from hapticbridge.run_description import SOURCE_PREFIX, STATE_ATTACHMENT, processor, versions
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.commands import Couple, Reset
+from hapticbridge.run.description import SOURCE_PREFIX, STATE_ATTACHMENT, processor, versions
+from hapticbridge.scene.rehearsal import start_handle
 
 SCENE = f"{SOURCE_PREFIX}peg_in_hole.xml"
 SHEET = SCENE.replace(".xml", ".toml")
@@ -502,7 +502,7 @@ def test_a_run_whose_handle_started_away_from_the_grip_is_invalid(
         return (x + 1e-3, *rest)
 
     with monkeypatch.context() as patch:
-        patch.setattr("hapticbridge.options.start_handle", elsewhere)
+        patch.setattr("hapticbridge.run.options.start_handle", elsewhere)
         path = hand(tmp_path)
     report = audit(path)
     assert (report.verdict, "'handle_origin'" in report.reason) == ("invalid", True), report.reason

@@ -10,11 +10,11 @@ from device_benches import FalconBench
 from report_runs import ANVIL
 
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, SimulatedDevice
-from hapticbridge.record import TickFlag, has_flag
+from hapticbridge.kernel.record import TickFlag, has_flag
 from hapticbridge.recording import read_recording
+from hapticbridge.run.bridge import Bridge
 
 RETREAT = """t,x,y,z,qw,qx,qy,qz
 0,0,0,0,1,0,0,0

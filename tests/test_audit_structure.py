@@ -10,9 +10,9 @@ from audit_cases import recorded, rewritten, verdict_of, without_model
 from cli_cases import Called
 
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
-from hapticbridge.record import CLOCK_FIELDS, TickFlag
+from hapticbridge.kernel.record import CLOCK_FIELDS, TickFlag
 from hapticbridge.recording import Recording, read_recording
+from hapticbridge.run.bridge import Bridge
 from hapticbridge.scene.load import scene_path
 
 

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
-from hapticbridge.commands import Couple, Switch
+from hapticbridge.demand.guard import Limits
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip, SceneError
-from hapticbridge.guard import Limits
-from hapticbridge.options import Workspace
-from hapticbridge.record import CLOCK_FIELDS
+from hapticbridge.kernel.record import CLOCK_FIELDS
 from hapticbridge.recording import read_recording
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.commands import Couple, Switch
+from hapticbridge.run.options import Workspace
 from hapticbridge.scene import load_scene
 
 

@@ -13,13 +13,13 @@ from audit_cases import ScriptedDevice, recorded, rewritten, without_model
 from report_runs import ANVIL, LOOSE
 
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
-from hapticbridge.commands import Command, Couple, Mark, Reset, Switch, tuning_ticks
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import CommandError, DeviceError, RecordingError
-from hapticbridge.guard import Limits
+from hapticbridge.demand.guard import Limits
+from hapticbridge.errors import CommandError, HapticBridgeError, RecordingError
 from hapticbridge.recording import read_recording
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.commands import Command, Couple, Mark, Reset, Switch, tuning_ticks
 
 T = 1e-3
 STEPS = tuning_ticks(T)
@@ -412,5 +412,5 @@ def test_a_run_that_is_not_recorded_cannot_be_marked(tmp_path: Path) -> None:
         assert bridge.run(0.05).ticks == 50
     with pytest.raises(RecordingError, match="button 2 is to mark"):
         Bridge(str(file), ScriptedDevice(swaying), LOOSE, mark=2)
-    with pytest.raises(DeviceError, match="mark button is 99"):
+    with pytest.raises(HapticBridgeError, match="mark is 99; it must be a whole number, 0 to 31"):
         Bridge(str(file), ScriptedDevice(swaying), LOOSE, mark=99)

@@ -17,12 +17,12 @@ from bridge_runs import sway
 from rendering_runs import WALL
 
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.bridge import Bridge
-from hapticbridge.commands import Couple
-from hapticbridge.guard import Limits
-from hapticbridge.record import TICK_DTYPE, Timeline, due_times
+from hapticbridge.demand.guard import Limits
+from hapticbridge.kernel.record import TICK_DTYPE, Timeline, due_times
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.summary import Summary
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.commands import Couple
+from hapticbridge.run.summary import Summary
 
 MISSED = {0: 2, 50: 1, 51: 7, 120: 30}
 

@@ -11,10 +11,10 @@ from audit_cases import ScriptedDevice, recorded
 from bridge_runs import fast, still, sway
 
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE
 from hapticbridge.recording import read_recording
+from hapticbridge.run.bridge import Bridge
 
 INPUTS = """<mujoco>
   <compiler angle="radian"/>

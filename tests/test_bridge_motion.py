@@ -13,10 +13,10 @@ from bridge_runs import fast, sway
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.audit import audit
+from hapticbridge.demand.guard import Limits
 from hapticbridge.errors import DeviceError, HapticBridgeError
-from hapticbridge.guard import Limits
-from hapticbridge.options import Workspace
 from hapticbridge.recording import read_recording
+from hapticbridge.run.options import Workspace
 
 
 def test_relative_poses_start_at_the_grip_and_absolute_ones_are_the_handle() -> None:

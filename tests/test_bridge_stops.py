@@ -18,7 +18,6 @@ from bridge_runs import REST, fast, still, sway
 from numpy.typing import NDArray
 
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.errors import (
     DeviceError,
     DeviceLost,
@@ -26,10 +25,11 @@ from hapticbridge.errors import (
     RecordingError,
     SafetyTrip,
 )
-from hapticbridge.record import TickFlag
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recorder, Ring, read_recording
 from hapticbridge.recording import recorder as stream_module
 from hapticbridge.recording.writer import RecordingWriter
+from hapticbridge.run.bridge import Bridge
 
 PATIENCE = 30.0
 

@@ -8,17 +8,17 @@ from typing import Any
 
 import pytest
 
-from hapticbridge.certificate import (
+from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import (
     DampingCondition,
     conditions_of,
     default_coupling,
     is_certified,
     worst_verdict,
 )
-from hapticbridge.coupling import Coupling
+from hapticbridge.demand.loop_setting import LoopSetting, delay_ticks, device_period
+from hapticbridge.demand.methods import METHODS, default_method
 from hapticbridge.device import DeviceInfo, SimulatedDevice
-from hapticbridge.loop_setting import LoopSetting, delay_ticks, device_period
-from hapticbridge.rendering import METHODS, default_method
 from hapticbridge.theory.bounds import NEEDED_SHARE
 
 T = 1e-3

@@ -18,7 +18,7 @@ from hapticbridge.check.version import SceneVariant
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, SceneError
-from hapticbridge.record import TICK_DTYPE
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.scene import read_scene
 
 Array = NDArray[np.float64]

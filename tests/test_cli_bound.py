@@ -138,3 +138,19 @@ def test_a_device_without_a_bound_is_refused(device: str, reason: str, call: Cal
     code, _, err = call(*f"bound --stiffness 2400 --device {device}".split())
     assert code == 2
     assert reason in err
+
+
+def test_a_device_whose_steps_shake_it_is_passive_but_for_them(
+    call: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = SimulatedDevice()
+    opened.info = replace(opened.info, resolution=5e-5, friction=0.0)
+    monkeypatch.setattr(zwidth, "open_device", lambda _spec, notify: opened)
+    command = ("bound", "--stiffness", 2400, "--damping", 1.7, "--device", "simulated")
+    code, out, _ = call(*command)
+    assert code == 1
+    assert "passive in any hand but for its encoder's steps" in " ".join(out.split())
+    assert "without friction no coupling is free of swings by steps" in " ".join(out.split())
+    assert "next:" not in out
+    opened.info = replace(opened.info, friction=1.0)
+    assert call(*command)[0] == 0

@@ -350,7 +350,7 @@ def test_hardware_and_fast_are_refused_together_before_anything_is_opened(
     def opened(*_: object, **__: object) -> None:
         raise AssertionError("it was opened first, and its user asked to home it")
 
-    for module in ("hapticbridge.cli.run", "hapticbridge.options"):
+    for module in ("hapticbridge.cli.run", "hapticbridge.run.options"):
         monkeypatch.setattr(f"{module}.device_for", opened)
     code, out, err = call("run", "point_mass", "--fast", "--device", f"{family.name}:serial=1")
     assert (code, out) == (2, "")

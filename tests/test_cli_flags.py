@@ -11,14 +11,14 @@ from typing import Any, Literal, get_args, get_origin
 import pytest
 from cli_cases import Called, one_sentence
 
-from hapticbridge.arguments import members, rule_of, types_of
+from hapticbridge.arguments import check_fields, members, rule_of, types_of
 from hapticbridge.cli.flags import Flag, built, flags_of, texts_of, values_of
 from hapticbridge.cli.main import COMMANDS, command_class
 from hapticbridge.cli.run import Run
 from hapticbridge.coupling import Coupling
-from hapticbridge.guard import Limits
-from hapticbridge.hands import Grasp, GripAxis
-from hapticbridge.options import BridgeOptions, Workspace
+from hapticbridge.demand.guard import Limits
+from hapticbridge.run.hands import Grasp, GripAxis
+from hapticbridge.run.options import BridgeOptions, Workspace
 
 OPTION_CLASSES: tuple[Any, ...] = BridgeOptions, Workspace, Limits, Coupling, Grasp, GripAxis
 
@@ -196,3 +196,13 @@ def test_words_after_two_dashes_are_no_flags() -> None:
     repeated = values_of(Run, "run", ["--set", "a=1", "peg", "--set=b=-2", "--ramp", "-1e-3"])
     assert repeated[("settings",)] == ("a=1", "b=-2")
     assert repeated["options", "limits", "ramp"] == -1e-3
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_defaults_of_a_command_are_valid(name: str) -> None:
+    command = command_class(name)
+    required = [flag for flag in flags_of(command) if flag.default is MISSING]
+    values: dict[tuple[str, ...], Any] = {
+        flag.path: flag.value(text_for(flag)) for flag in required if len(flag.path) == 1
+    }
+    check_fields(built(command, values))

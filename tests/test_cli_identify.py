@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from hapticbridge.certificate import default_coupling
 from hapticbridge.cli import main, terminal
 from hapticbridge.cli.identify import coupling_of_run
 from hapticbridge.clock import SimulatedClock
+from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.device import open_device
 from hapticbridge.device.profile import read_profile
 from hapticbridge.identify import Estimate, identify

@@ -332,7 +332,7 @@ def unheeded() -> Iterator[list[int]]:
 
 @SIGNALS
 @pytest.mark.parametrize(
-    "moment", ["session.prepare", "bridge.Bridge.run", "bridge.Bridge.__exit__"]
+    "moment", ["run.session.prepare", "run.bridge.Bridge.run", "run.bridge.Bridge.__exit__"]
 )
 def test_a_signal_before_and_after_the_loop_ends_the_run_cleanly(
     name: str,
@@ -353,7 +353,7 @@ def test_a_signal_before_and_after_the_loop_ends_the_run_cleanly(
     monkeypatch.setattr(f"hapticbridge.{moment}", signalled)
     code, out, err = call("run", "point_mass", "--fast", "--duration", 0.01, "--record", path)
     assert device.is_closed and not np.any(device.writes) and not unheeded
-    if moment in {"session.prepare", "bridge.Bridge.run"}:  # before the first tick
+    if moment in {"run.session.prepare", "run.bridge.Bridge.run"}:  # before the first tick
         ending = *STOPS[name], ""
         assert (code, err.splitlines()[-1], out) == ending
         assert not path.exists()

@@ -9,6 +9,7 @@ import pytest
 from cli_cases import Called, facts_of
 
 from hapticbridge.device import SimulatedDevice
+from hapticbridge.theory.bounds import late_minimum_damping, stiffest_late_coupling
 
 ZWIDTH = "zwidth --damping 2 --mass 0.1 --friction 0.05 --resolution 1e-5 --rate 1000"
 FREE = "simulated:hand=none,resolution=1e-6"
@@ -77,7 +78,7 @@ def test_a_device_is_closed_whatever_was_refused(
     code, _, err = call("zwidth", "--measure", "mouse")
     assert code == 2
     assert "no force moves this device along x, y or z, so it has no walls to try" in err
-    for wrong in ("--axis q", "--damping nan"):
+    for wrong in ("--axis q", "--damping 1e31"):
         assert call(*f"zwidth --measure {FREE} {wrong}".split())[0] == 2
     assert len(closed) == 2
 
@@ -85,3 +86,21 @@ def test_a_device_is_closed_whatever_was_refused(
 def test_a_delay_is_told_as_the_ticks_that_it_counts(call: Called) -> None:
     assert "a delay of 140 µs counts as 1 tick\n" in call(*f"{ZWIDTH} --delay 0.00014".split())[2]
     assert "counts as" not in call(*ZWIDTH.split())[2]
+
+
+@pytest.mark.parametrize("delay", [1e-3, 3e-3])
+def test_the_coupling_to_use_behind_a_delay_holds_for_every_scene(
+    delay: float, call: Called
+) -> None:
+    _, facts = facts_of(call, "zwidth", "--damping", 2, "--delay", delay)
+    law = facts["corner"]["law"]
+    best = stiffest_late_coupling(2.0, 1e-3, delay, 1)
+    assert (law["stiffness"], law["damping"]) == pytest.approx(best)
+    needed = late_minimum_damping(law["stiffness"], law["damping"], 1e-3, delay)
+    assert needed == pytest.approx(0.85 * 2.0)
+    assert facts["corner"]["limited_by"] == "passive for any hand behind the delay"
+    # friction that does not hold the steps lowers both gains
+    weak = "--friction", 0.005, "--resolution", 1e-5
+    _, facts = facts_of(call, "zwidth", "--damping", 2, "--delay", delay, *weak)
+    law = facts["corner"]["law"]
+    assert law["stiffness"] * 1e-5 / 2 + law["damping"] * 1e-5 / 1e-3 <= 0.005

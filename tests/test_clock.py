@@ -8,7 +8,7 @@ import pytest
 
 from hapticbridge import clock as clock_module
 from hapticbridge.clock import RealClock, SimulatedClock, running_ns, slept_ns
-from hapticbridge.session import SUSPENDED_NS
+from hapticbridge.run.session import SUSPENDED_NS
 
 PERIOD = 1_000_000
 

@@ -11,7 +11,12 @@ from audit_cases import COUPLING, ScriptedDevice
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hapticbridge.commands import (
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.loop_setting import LoopSetting
+from hapticbridge.demand.methods import method_named
+from hapticbridge.device import AXES
+from hapticbridge.errors import CommandError
+from hapticbridge.run.commands import (
     INTERVAL,
     LONGEST_LINE,
     MAX_WAITING,
@@ -27,11 +32,6 @@ from hapticbridge.commands import (
     command_of,
     line_of,
 )
-from hapticbridge.device import AXES
-from hapticbridge.errors import CommandError
-from hapticbridge.guard import Limits
-from hapticbridge.loop_setting import LoopSetting
-from hapticbridge.rendering import method_named
 
 T = 1e-3
 INFO = ScriptedDevice(lambda _: (0, 0, 0, 1, 0, 0, 0)).info
@@ -240,3 +240,29 @@ def test_what_is_needed_is_what_the_certificate_says(substeps: int, delay: float
             assert need == pytest.approx(said, rel=1e-9)
         else:  # read off a table, on the safe side
             assert said * (1 - 1e-9) <= need <= 1.01 * said
+
+
+def test_friction_for_the_encoders_steps_is_a_limit_of_its_own_and_named() -> None:
+    """Half of the steps' condition at B' = 0: f_c >= K Δ/2, so K <= 1500 N/m."""
+    allowed = allowance("lossless", resolution=2e-5, friction=0.015)
+    assert allowed.translation.max_stiffness(0.0) == pytest.approx(1500.0, rel=1e-6)
+    assert allowance("lossless").translation.max_stiffness(0.0) > 3000.0
+    with pytest.raises(CommandError) as refused:
+        allowed.check(Couple(2000.0, 0.5))
+    assert str(refused.value) == (
+        "stiffness 2000 N/m with damping 0.5 N s/m needs 0.02 N of friction for the encoder's "
+        "steps of 20 µm; the device has 0.015 N"
+    )
+    assert "its friction of 15 mN for its steps of 20 µm" in allowed.reason()
+    allowed.check(Couple(1400.0, 0.5))
+    assert "friction" not in allowance(resolution=2e-5, friction=None).reason()
+
+
+def test_without_friction_no_coupling_may_shake_more_than_the_starts() -> None:
+    allowed = allowance("lossless", resolution=2e-5, friction=0.0)
+    start = allowed.start
+    allowed.check(Couple(start.stiffness, start.damping))
+    allowed.check(Couple(0.9 * start.stiffness, start.damping))
+    with pytest.raises(CommandError, match="the device has none"):
+        allowed.check(Couple(1.1 * start.stiffness, start.damping))
+    assert "without friction they shake any coupling" in allowed.reason()

@@ -13,10 +13,10 @@ from audit_cases import recorded, rewritten, tapped
 from cli_cases import Called
 from numpy.typing import NDArray
 
-from hapticbridge.compare import compare
 from hapticbridge.errors import RecordingError
-from hapticbridge.record import TickFlag
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import read_recording, reader
+from hapticbridge.tools.compare import compare
 
 
 @pytest.fixture(scope="module")

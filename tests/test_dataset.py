@@ -16,10 +16,10 @@ from cli_cases import Called, one_sentence
 from PIL import Image
 
 import hapticbridge as hb
-from hapticbridge.dataset import write_dataset
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.film import Shot
 from hapticbridge.recording import read_recording
+from hapticbridge.replay.film import Shot
+from hapticbridge.tools.dataset import write_dataset
 
 pq: Any = importlib.import_module("pyarrow.parquet")
 

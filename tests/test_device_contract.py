@@ -47,7 +47,7 @@ from hapticbridge.device.rawhid.serial import open_serial
 from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.device.wheel.device import open_wheel
 from hapticbridge.errors import DeviceError
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.testing.device_contract import CONTRACT, Check
 
 

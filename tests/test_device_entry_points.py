@@ -187,7 +187,7 @@ def test_a_broken_package_costs_its_own_device_only(
     with pytest.raises(DeviceError, match=f"the .*hapticbridge-rail.*{words}"):
         open_device("rail")
     assert [driver.name for driver in all_drivers()].count("mouse") == 1
-    assert [spot for spot in blind_spots() if words in spot]
+    assert [spot for spot in blind_spots() if words in spot.sentence]
     code, out, err = call("devices")
     assert code == 0
     assert words.partition(":")[0] in " ".join((out + err).split())

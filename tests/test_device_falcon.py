@@ -18,7 +18,7 @@ from hapticbridge.device.falcon.device import FalconDevice
 from hapticbridge.device.falcon.protocol import read_firmware
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 STALE = int(TickFlag.STALE_SAMPLE)
 

@@ -19,8 +19,8 @@ from hapticbridge.device.driver import FoundDevice
 from hapticbridge.device.force_dimension import FILES, MODELS, ForceDimensionDevice
 from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.pose import quaternion_log
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.pose import quaternion_log
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 WRENCH = np.array([1.0, -0.5, 0.3, 0.01, -0.02, 0.005])
 

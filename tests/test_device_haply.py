@@ -22,7 +22,7 @@ from hapticbridge.device.trajectory import Motion
 from hapticbridge.device.transport import websocket as transport
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.files import install_command
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 FORCE = np.array([0.4, -0.3, 0.2, 9.0, 9.0, 9.0])
 

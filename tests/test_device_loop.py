@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.clock import Clock
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device import Device, Motion, SimulatedDevice, device_for
 from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.pid import device as sheet
@@ -29,11 +30,10 @@ from hapticbridge.device.pid.device import open_pid
 from hapticbridge.device.profile import read_profile
 from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceError, SafetyTrip
-from hapticbridge.guard import Limits
 from hapticbridge.identify import identify
 from hapticbridge.identify.identify import measured_profile
-from hapticbridge.options import Workspace
-from hapticbridge.record import CLOCK_FIELDS, TickFlag
+from hapticbridge.kernel.record import CLOCK_FIELDS, TickFlag
+from hapticbridge.run.options import Workspace
 from hapticbridge.scene import load_scene, scene_path
 
 WIDE = 0.12

@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 from view_cases import FLOOR
 
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.cli.run import Run
 from hapticbridge.device.mouse import REST, MouseDevice, Pose, line_of_pose, pose_of_line
 from hapticbridge.errors import DeviceError, HapticBridgeError
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.recording import read_recording
+from hapticbridge.run.bridge import Bridge
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 

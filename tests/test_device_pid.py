@@ -18,7 +18,7 @@ from hapticbridge.device.pid.device import LIFE, RESTART, PidDevice, open_pid
 from hapticbridge.device.profile import Profile, Quantity
 from hapticbridge.device.transport.hid import HidLink, find
 from hapticbridge.errors import DeviceError
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 STALE = int(TickFlag.STALE_SAMPLE)
 
@@ -261,7 +261,7 @@ def test_a_profile_says_the_scale_of_its_numbers(monkeypatch: pytest.MonkeyPatch
     [
         ({"damping": 1.0}, r"damping is in newtons and metres, .* state newtons= and travel= too"),
         ({"newtons": 2.0, "mass": 1.0}, r"mass is in newtons and metres, .* state travel= too"),
-        ({**SCALE, "damping": -1.0}, r"damping = -1\.0"),
+        ({**SCALE, "damping": -1.0}, r"damping is -1\.0"),
         ({"newtons": 0.0}, r"newtons is 0\.0 N; it must be finite and > 0"),
         ({"travel": math.nan}, "travel is nan m; it must be finite and > 0"),
         ({"reverse": "z"}, "reverse is 'z'; it must be 'x', 'y' or 'xy'"),

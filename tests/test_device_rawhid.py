@@ -22,7 +22,7 @@ from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
 from hapticbridge.device.watchdog import SILENCE
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 STALE = int(TickFlag.STALE_SAMPLE)
 PUSH = np.array([1.0, 2.0, 3.0, 0.01, 0.02, 0.03])
@@ -58,7 +58,7 @@ def test_the_data_sheet_is_what_the_user_and_the_device_say() -> None:
         (Claims(torque_limit=NAN), "does not report its torque_limit"),
         (Claims(speed_limit=NAN), "does not report its speed_limit"),
         (Claims(rate=NAN), "does not report its rate"),
-        (Claims(mass=-1.0), "reports an impossible data sheet: mass = -1.0"),
+        (Claims(mass=-1.0), "reports an impossible data sheet: mass is -1.0 kg"),
         (Claims(axes=0), "reports an impossible data sheet: axes"),
         (Claims(axes=128), "reports an impossible data sheet: axes"),
     ],

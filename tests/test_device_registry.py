@@ -7,14 +7,14 @@ from dataclasses import replace
 import pytest
 from cli_cases import Called
 
-from hapticbridge import options as arrangement
-from hapticbridge.bridge import Bridge
 from hapticbridge.cli import run
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device import registry as library
 from hapticbridge.device.falcon.device import DRIVER
 from hapticbridge.errors import DeviceError
-from hapticbridge.guard import Limits
+from hapticbridge.run import options as arrangement
+from hapticbridge.run.bridge import Bridge
 
 
 class Counted(SimulatedDevice):
@@ -26,7 +26,7 @@ class Counted(SimulatedDevice):
 
 
 @pytest.mark.parametrize(
-    "option", [("--force-limit", "1e6"), ("--stiffness", "-1"), ("--ramp", "-1")]
+    "option", [("--force-limit", "1e6"), ("--stiffness", "1e9"), ("--clutch", "9")]
 )
 def test_a_run_refused_late_lets_its_device_go(
     call: Called, monkeypatch: pytest.MonkeyPatch, option: tuple[str, str]

@@ -32,7 +32,7 @@ from hapticbridge.device.rawhid.device import RawHidDevice
 from hapticbridge.device.rawhid.serial import BAUDS, SystemPorts, open_serial
 from hapticbridge.errors import DeviceError, DeviceLost, IdentificationError
 from hapticbridge.identify import identify
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 # Framing
 

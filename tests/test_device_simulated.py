@@ -19,7 +19,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.device.trajectory import lissajous
 from hapticbridge.errors import DeviceError
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
 Array = NDArray[np.float64]
@@ -408,14 +408,14 @@ TOO_FAST = SimulatedDevice(friction=0.1, hand=Hand(mass=0, stiffness=1e12))
     ("build", "words"),
     [
         (lambda: SimulatedDevice(mass=0.0), "mass is 0.0 kg; it must be finite and > 0"),
-        (lambda: SimulatedDevice(damping=-1.0), "damping = -1.0"),
-        (lambda: SimulatedDevice(friction=math.nan), "friction = nan"),
-        (lambda: SimulatedDevice(resolution=math.inf), "resolution = inf"),
-        (lambda: SimulatedDevice(force_limit=-2.0), "force_limit = -2.0"),
+        (lambda: SimulatedDevice(damping=-1.0), "damping is -1.0"),
+        (lambda: SimulatedDevice(friction=math.nan), "friction is nan"),
+        (lambda: SimulatedDevice(resolution=math.inf), "resolution is inf"),
+        (lambda: SimulatedDevice(force_limit=-2.0), "force limit is -2.0 N"),
         (lambda: SimulatedDevice(delay=101), "delay is 101; it must be 0 to 100 whole samples"),
-        (lambda: SimulatedDevice(delay=1.5), "delay = 1.5"),  # type: ignore[arg-type]
-        (lambda: Hand(stiffness=-1.0), "hand stiffness = -1.0"),
-        (lambda: Hand(mass="heavy"), "hand mass = 'heavy'"),  # type: ignore[arg-type]
+        (lambda: SimulatedDevice(delay=1.5), "delay is 1.5"),  # type: ignore[arg-type]
+        (lambda: Hand(stiffness=-1.0), "hand stiffness is -1.0"),
+        (lambda: Hand(mass="heavy"), "hand mass is 'heavy'"),  # type: ignore[arg-type]
         (lambda: TOO_FAST.start(1e-2), "too fast for friction"),
         (
             lambda: SimulatedDevice(hand=WORST).start(2e-3),

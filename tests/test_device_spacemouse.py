@@ -21,7 +21,7 @@ from hapticbridge.device import spacemouse as driver
 from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.spacemouse import SpaceMouseDevice, decoded, open_spacemouse
 from hapticbridge.errors import DeviceError
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 
 PERIOD = 1e-3
 counts = st.integers(-32768, 32767)
@@ -182,9 +182,9 @@ def test_starting_again_goes_back_to_the_origin() -> None:
     ("options", "words"),
     [
         ({"speed": 0.0}, "speed is 0.0 m/s; it must be finite and > 0"),
-        ({"turn": -1.0}, "turn = -1.0"),
+        ({"turn": -1.0}, "turn is -1.0"),
         ({"dead_band": 1.0}, "dead_band is 1.0; it must be below 1"),
-        ({"dead_band": -0.1}, "dead_band = -0.1"),
+        ({"dead_band": -0.1}, "dead_band is -0.1"),
         ({"serial": "7"}, "no device 'spacemouse' has serial '7'"),
     ],
 )

@@ -19,7 +19,7 @@ from hapticbridge.device.touch.device import RealWaiting, TouchDevice, open_touc
 from hapticbridge.device.touch.servo import FILES, Hd, Servo
 from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 WRENCH = np.array([1.0, -0.5, 0.3, 0.01, -0.02, 0.005])
 

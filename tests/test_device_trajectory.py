@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from hapticbridge.device import Motion, ReplayDevice, TrajectoryDevice, open_device, read_motion
 from hapticbridge.device.base import Device
 from hapticbridge.errors import DeviceError, RecordingError
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.recording import RecordingWriter
 
 Array = NDArray[np.float64]

@@ -27,7 +27,7 @@ from hapticbridge.device.falcon.protocol import READ_FROM, SIZE, WRITE_TO, encod
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.transport.usb import UsbContext, UsbLink, find, libusb
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 
 LONGEST = 5.0  # s, far beyond what anything here takes, for waits that end by themselves
 

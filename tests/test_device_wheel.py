@@ -228,7 +228,7 @@ def test_an_unplugged_wheel_is_lost() -> None:
         ({"range": 4000.0}, "range is 4000; it must be at most 3600 degrees"),
         ({"axis": "x"}, "axis is 'x'; it must be one of 'rx', 'ry', 'rz'"),
         ({"reverse": 2.0}, "reverse is 2.0; it must be 1"),
-        ({"rotational_damping": -1.0}, "rotational_damping = -1.0"),
+        ({"rotational_damping": -1.0}, "rotational_damping is -1.0"),
         ({"serial": "/dev/input/event0"}, "no device 'wheel' has serial '/dev/input/event0'"),
     ],
 )

@@ -17,13 +17,13 @@ from hapticbridge.audit import audit
 from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.replay import AuditedHand, comparison
 from hapticbridge.confinement import ForeignSceneError
+from hapticbridge.demand.methods import METHODS, unguarded_parameters
 from hapticbridge.errors import SafetyTrip, SceneError
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.mujoco_c import model_addresses, warning_of
+from hapticbridge.kernel.record import CLOCK_FIELDS
 from hapticbridge.kernel.state import BoundKernel
-from hapticbridge.record import CLOCK_FIELDS
 from hapticbridge.recording import read_recording
-from hapticbridge.rendering import METHODS, unguarded_parameters
 from hapticbridge.scene import load_scene
 
 PLATE = """<mujoco>

@@ -21,12 +21,12 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from recording_cases import EPOCH, META, random_rows, write
 
-from hapticbridge.bridge import Bridge
 from hapticbridge.errors import RecordingError
-from hapticbridge.export import ENERGIES, export, sidecar_of
 from hapticbridge.files import install_command
-from hapticbridge.record import FORMAT, TICK_DTYPE, TickFlag
+from hapticbridge.kernel.record import FORMAT, TICK_DTYPE, TickFlag
 from hapticbridge.recording import read_recording, reader
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.tools.export import ENERGIES, export, sidecar_of
 
 h5py: Any = importlib.import_module("h5py")
 pq: Any = importlib.import_module("pyarrow.parquet")

@@ -24,10 +24,10 @@ import hapticbridge as hb
 from hapticbridge.cli import main
 from hapticbridge.confinement import ForeignSceneError
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.film import Shot, draw, still
-from hapticbridge.film_process import Stage, film_ticks, force_colour, write_film
 from hapticbridge.kernel.codes import HANDLE
 from hapticbridge.recording import read_recording
+from hapticbridge.replay.film import Shot, draw, still
+from hapticbridge.replay.stage import Stage, film_ticks, force_colour, write_film
 from hapticbridge.signals import StopSignal, interrupting_on_signals
 
 SCENE = """<mujoco model="two">
@@ -235,7 +235,7 @@ def work(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
     def replace(**functions: Callable[..., object]) -> None:
         for name, function in functions.items():
-            monkeypatch.setattr(f"hapticbridge.film._{name}", function)
+            monkeypatch.setattr(f"hapticbridge.replay.film._{name}", function)
 
     return replace
 
@@ -269,7 +269,7 @@ def test_a_driver_that_crashes_ends_its_own_process_alone(
 def test_where_no_renderer_works_a_sentence_says_what_to_install(
     sway: Path, call: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hapticbridge.film.RENDERERS", ("disable",))
+    monkeypatch.setattr("hapticbridge.replay.film.RENDERERS", ("disable",))
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     code, _, err = call("render", sway, tmp_path / "a.png")
     assert code == 2

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import hapticbridge as hb
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.codes import OK
-from hapticbridge.run_description import parameters_of
+from hapticbridge.run.description import parameters_of
 
 ATTACKS = 100
 """Number of random attacks; ``scripts/attack`` makes as many as it is asked for."""

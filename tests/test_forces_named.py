@@ -12,12 +12,12 @@ from audit_cases import recorded
 from numpy.typing import NDArray
 
 from hapticbridge.audit import audit
-from hapticbridge.film_process import Stage
-from hapticbridge.options import Workspace
 from hapticbridge.recording import Recording, read_recording
+from hapticbridge.replay.stage import Stage
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.page import head_facts
-from hapticbridge.summary import Summary
+from hapticbridge.run.options import Workspace
+from hapticbridge.run.summary import Summary
 from hapticbridge.units import format_forces, format_si, format_wrenches
 from hapticbridge.view.replay import Replay
 

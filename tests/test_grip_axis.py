@@ -16,7 +16,7 @@ import hapticbridge as hb
 from hapticbridge.cli.main import main
 from hapticbridge.device import GrippingDevice, SimulatedDevice
 from hapticbridge.errors import DeviceError, HapticBridgeError
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.testing.device_contract import CONTRACT
 
 JOINT = "joint:hinge"
@@ -173,12 +173,12 @@ def test_the_simulated_one_fulfils_the_contract(check: Callable[[Any], None]) ->
         ),
         (lambda: bridge_of("simulated", hb.GripAxis("jaw")), "load it with these"),
         (lambda: bridge_of(SimulatedDevice(), hb.GripAxis("hinge")), "has no grip axis for joint"),
-        (lambda: hb.GripAxis(""), "it must name a joint"),
+        (lambda: hb.GripAxis(""), "joint is ''; it must be a text that is not empty"),
         (lambda: hb.GripAxis("hinge", 0.0), "must be finite and not 0"),
         (lambda: turned_away(ASIDE), "a joint is moved by that axis"),
         (lambda: loaded("left", "joint:jaw"), "no hinge or slide 'jaw' to hold; .* 'hinge'"),
         (lambda: loaded(JOINT, "left"), "can only be held beside a site or a body"),
-        (lambda: Fingers(axes=("y",)), "grip_axis = .* must be a DeviceInfo with the axis x"),
+        (lambda: Fingers(axes=("y",)), "grip axis is .* must have the axis x"),
     ],
 )
 def test_what_cannot_be_is_refused(call: Callable[[], Any], message: str) -> None:

@@ -23,22 +23,22 @@ from numpy.typing import NDArray
 from report_runs import ANVIL
 
 import hapticbridge as hb
-from hapticbridge import guard as start_module
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.coupling import Coupling
-from hapticbridge.device.watchdog import ForceOffGuardian
-from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
-from hapticbridge.guard import (
+from hapticbridge.demand import guard as start_module
+from hapticbridge.demand.guard import (
     Limits,
     guard_parameters_for,
     wait_until_still,
 )
+from hapticbridge.device.watchdog import ForceOffGuardian
+from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.kernel.parameters import UNGUARDED, GuardParameters
-from hapticbridge.options import BridgeOptions, Workspace
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.options import BridgeOptions, Workspace
 
 LIMIT = 10.0
 NOTHING = 1e-6

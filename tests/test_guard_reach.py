@@ -14,13 +14,13 @@ from audit_cases import ScriptedDevice
 from bridge_runs import fast
 
 from hapticbridge.audit import audit
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device import DeviceInfo
 from hapticbridge.device.profile import SHIPPED, profile_named, profiles
 from hapticbridge.errors import DeviceError
-from hapticbridge.guard import Limits
-from hapticbridge.options import Workspace
-from hapticbridge.record import TickFlag
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import read_recording
+from hapticbridge.run.options import Workspace
 
 REACH = 0.02
 HOME = 0.01

@@ -14,7 +14,7 @@ from cli_cases import Called
 
 from hapticbridge.cli import main
 from hapticbridge.cli.guide import FOLDER, TOPICS, page
-from hapticbridge.record import TICK_DTYPE, TickFlag
+from hapticbridge.kernel.record import TICK_DTYPE, TickFlag
 
 ROOT = Path(__file__).parents[1]
 

@@ -18,14 +18,14 @@ from two_hands import BAR, PEG_AND_BLOCK, SCENES, two_handed
 
 import hapticbridge as hb
 from hapticbridge.cli.main import main
-from hapticbridge.commands import Command, Couple, Reset, Switch
 from hapticbridge.device import device_for
 from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceLost, HapticBridgeError
-from hapticbridge.hands import DeviceGroup
-from hapticbridge.record import TickFlag, has_flag
+from hapticbridge.kernel.record import TickFlag, has_flag
 from hapticbridge.recording.format import MAX_HANDS
+from hapticbridge.run.commands import Command, Couple, Reset, Switch
+from hapticbridge.run.hands import DeviceGroup
 from hapticbridge.whatif import what_if
 
 SHARED = ("tick", "deadline_ns", "read_ns", "kinetic", "potential")
@@ -259,7 +259,7 @@ TWO = (hb.Grasp("left"), hb.Grasp("right"))
         (lambda: bridge_of(("left", "right")), "several hands are named by a Grasp each"),
         (lambda: bridge_of(TWO, {"damping": 1.0}), "has a coupling of its own"),
         (lambda: bridge_of("simulated"), "was loaded with 2 grips, and one device holds one"),
-        (lambda: hb.Grasp(""), "grip is ''; it must name a site or a body"),
+        (lambda: hb.Grasp(""), "grip is ''; it must be a text that is not empty"),
         (lambda: bridge_of(twice(Scripted("one", 0.0))), "two hands have one device"),
     ],
 )

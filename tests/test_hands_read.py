@@ -11,14 +11,14 @@ from two_hands import BAR, TONGS, two_handed
 
 import hapticbridge as hb
 from hapticbridge.cli.main import main
-from hapticbridge.compare import compare
 from hapticbridge.confinement import ForeignSceneError
-from hapticbridge.film import Shot, still
 from hapticbridge.recording.reader import open_hands, read_hands
 from hapticbridge.recording.recorder import salvage
+from hapticbridge.replay.film import Shot, still
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.plots import draw_recording
-from hapticbridge.run_description import requested_of
+from hapticbridge.run.description import requested_of
+from hapticbridge.tools.compare import compare
 from hapticbridge.whatif import what_if
 
 
@@ -200,8 +200,8 @@ def test_the_trip_of_a_hand_is_repeated(tmp_path: Path) -> None:
     ):
         bridge.run(0.3)
     recorded, again, _ = what_if(path, {}, in_process=True).runs
-    assert "hand at 'right': the tool is farther" in recorded.trip
-    assert again.trip == recorded.trip
+    assert "hand at 'right': the tool is farther" in str(recorded.report.trip)
+    assert again.report.trip == recorded.report.trip
 
 
 def test_runs_of_several_hands_are_compared_hand_by_hand(bar: Path, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from report_runs import LOOSE
 from view_cases import AT_ONCE, pressed
 
 from hapticbridge.audit import audit
+from hapticbridge.demand.trip import Trip, TripCode
 from hapticbridge.recording import read_recording
 from hapticbridge.report import write_report
 from hapticbridge.scene import load_scene
@@ -102,7 +103,7 @@ def report_of(path: Path, page: Path) -> None:
 def report_of_edited(path: Path, page: Path) -> None:
     """Writes the report on a file whose metadata and events are script, too."""
     recording = read_recording(path)
-    meta = {key: EVIL for key in recording.meta if key not in ("epoch_ns", "period_s")}
+    meta = {key: EVIL for key in recording.meta if key not in ("format", "epoch_ns", "period_s")}
     trip = {"event": "trip", "tick": 9, "time_ns": 0, "reason": EVIL, EVIL: EVIL, "by": EVIL}
     edited = rewritten(
         recording, page.with_suffix(".mcap"), meta=meta, events=[*recording.events, trip]
@@ -112,7 +113,8 @@ def report_of_edited(path: Path, page: Path) -> None:
 
 def report_of_a_trip(path: Path, page: Path) -> None:
     recording = read_recording(path)
-    trip = {"event": "trip", "tick": 299, "time_ns": 0, "reason": EVIL}
+    trip = {"event": "trip", "tick": 299, "time_ns": 0}
+    trip |= Trip(TripCode.DEVICE, 299, detail=EVIL).details()
     edited = rewritten(recording, page.with_suffix(".mcap"), events=[*recording.events, trip])
     report_of(edited, page)
 

@@ -17,7 +17,7 @@ from hapticbridge.errors import DeviceError, DeviceLost, IdentificationError
 from hapticbridge.identify import AxisFit, Estimate, Identification, fit_axis, identify
 from hapticbridge.identify.fit import noise_of
 from hapticbridge.identify.identify import duration_at, measured_profile, step_of
-from hapticbridge.record import TickFlag
+from hapticbridge.kernel.record import TickFlag
 
 PERIOD = 1e-3
 TURNING = ("rotational_inertia", "rotational_damping")

@@ -44,8 +44,8 @@ from hapticbridge.kernel.law import (
     spring_energy,
     spring_length,
 )
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.tick import after_step, before_step
-from hapticbridge.record import TICK_DTYPE
 
 MASS = 0.1
 STIFF = Coupling(2000.0, 2.0, 2.0, 2e-3)

@@ -14,19 +14,19 @@ from rendering_runs import FREE_MASS
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import prepare, unguarded_parameters
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.trajectory import pose_at, read_motion
-from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.lossless import evaluate_tool_passive, write_tool_bias
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
 from hapticbridge.lab.closed_loop import ClosedLoop
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
-from hapticbridge.rendering import prepare, unguarded_parameters
+from hapticbridge.run.summary import Ledger
 from hapticbridge.scene import Scene, load_scene, scene_path
-from hapticbridge.summary import Ledger
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
 # --- accuracy -------------------------------------------------------------------------------------

@@ -17,16 +17,16 @@ from test_bridge_commands import FLOOR
 
 from hapticbridge.audit import audit
 from hapticbridge.audit.replay import Resimulator
-from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import DEVICE_LIMITS, guard_parameters_for, limits_for
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.guard import DEVICE_LIMITS, guard_parameters_for, limits_for
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT
 from hapticbridge.kernel.passivity_controller import observe_energy
+from hapticbridge.kernel.record import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 from hapticbridge.kernel.state import STATE_DTYPE
-from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 from hapticbridge.recording import open_recording, read_recording
-from hapticbridge.run_description import parameters_of
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.description import parameters_of
 from hapticbridge.theory.sampled_loop import WorstHand
 
 T = 1e-3
@@ -171,7 +171,7 @@ def rubbed_then_shaken(tick: int) -> tuple[float, ...]:
 def test_what_an_environment_burnt_does_not_pay_for_all_that_it_creates_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hapticbridge.guard.ENERGY_CREDIT", 1e-4)
+    monkeypatch.setattr("hapticbridge.demand.guard.ENERGY_CREDIT", 1e-4)
     scene, path = tmp_path / "floor.xml", tmp_path / "run.mcap"
     scene.write_text(FLOOR)
     device, coupling = ScriptedDevice(rubbed_then_shaken), Coupling(2000.0, 0.5, 1.0, 5e-4)

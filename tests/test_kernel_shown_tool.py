@@ -13,15 +13,15 @@ from kernel_runs import IDENTITY, T
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import method_named, prepare
 from hapticbridge.device import AXES, DEFAULT_HAND, DeviceInfo
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, take_result, whole_tick
-from hapticbridge.options import steady_rotational_stiffness
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
-from hapticbridge.rendering import method_named, prepare
+from hapticbridge.run.options import steady_rotational_stiffness
 from hapticbridge.scene import load_scene
 
 LAW = Coupling(800.0, 0.5, 0.8, 5e-4)

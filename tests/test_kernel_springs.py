@@ -11,12 +11,12 @@ from random_hands import random_motion
 from test_kernel_lossless import OUT_AND_BACK, SLIDER, STOP, bound, circling, distance, led
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import METHODS
 from hapticbridge.device.trajectory import pose_at
 from hapticbridge.kernel.codes import HALF_DONE, OK
+from hapticbridge.kernel.record import TICK_DTYPE, TickFlag
 from hapticbridge.kernel.tick import answer_step, before_step, close_tick, simulate
-from hapticbridge.record import TICK_DTYPE, TickFlag
-from hapticbridge.rendering import METHODS
-from hapticbridge.summary import coarse_spring
+from hapticbridge.run.summary import coarse_spring
 
 ASKED = Coupling(1000.0, 5.0, 1.0, 0.005)
 

@@ -19,6 +19,8 @@ from swing_cases import ALARM, GRIPS, VERY_FIRM, OnItsStop, alarms, bunched, sha
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.timekeeping import Alarm
 from hapticbridge.device import (
     AXES,
     DEFAULT_HAND,
@@ -28,10 +30,8 @@ from hapticbridge.device import (
     SimulatedDevice,
     TrajectoryDevice,
 )
-from hapticbridge.guard import Limits
-from hapticbridge.record import TickFlag
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording.recorder_process import RunState
-from hapticbridge.timekeeping import UNKNOWN
 
 
 @pytest.mark.parametrize("name", LOOP_SCENES)
@@ -75,7 +75,7 @@ def test_a_shaken_device_2_ms_late_is_no_alarm(name: str, grip: str) -> None:
     assert device.info.delay is None
     with hb.Bridge(name, device, clock=hb.SimulatedClock()) as bridge:
         summary = bridge.run(3.0)
-    assert not summary.timekeeping.watch
+    assert not summary.timekeeping.alarm
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_a_late_device_is_no_alarm_if_it_states_its_delay(
         device.info = replace(device.info, delay=stated)
         with hb.Bridge(name, device, clock=hb.SimulatedClock()) as bridge:
             summary = bridge.run(3.0)
-        assert bool(summary.timekeeping.watch) is is_alarm
+        assert bool(summary.timekeeping.alarm) is is_alarm
 
 
 @pytest.mark.parametrize("name", ["hammer", "virtual_wall", "ratchet", "peg_in_hole"])
@@ -109,7 +109,7 @@ def test_a_probe_lowers_the_force_for_a_moment_and_is_no_alarm(tmp_path: Path) -
     with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock(), recording=path) as bridge:
         summary = bridge.run(3.0)
     assert summary.is_certified
-    assert not summary.timekeeping.fault
+    assert not summary.certification.reason
     ticks = hb.read_recording(path).ticks
     is_probed = (ticks["flags"] & int(TickFlag.PROBED)) != 0
     begins = 1 + np.flatnonzero(np.diff(is_probed.astype(int)) == 1)
@@ -163,7 +163,7 @@ def test_neither_a_soft_stop_nor_an_unsteady_digit_hides_a_reversed_motor(
     with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock(), limits=limits) as bridge:
         summary = bridge.run(2.5)
         share = bridge.latest_records(2500)["share"]
-    assert UNKNOWN in summary.timekeeping.watch
+    assert summary.timekeeping.alarm is Alarm.UNANSWERED
     assert (share[2000:] == 0.25).all()
 
 
@@ -175,7 +175,7 @@ def test_a_hand_that_presses_into_a_soft_stop_is_acquitted(step: float) -> None:
         summary = bridge.run(2.5)
         flags = bridge.latest_records(2500)["flags"]
     assert np.bitwise_or.reduce(flags) & TickFlag.PROBED
-    assert not summary.timekeeping.watch
+    assert not summary.timekeeping.alarm
 
 
 SPRUNG = """<mujoco><compiler angle="radian"/>
@@ -276,7 +276,7 @@ def test_a_hand_that_friction_holds_at_a_wall_is_acquitted_once() -> None:
     is_probed = flags & int(TickFlag.PROBED) != 0
     assert np.count_nonzero(np.diff(is_probed.astype(int)) == 1) == 1
     assert summary.is_certified
-    assert not summary.timekeeping.watch
+    assert not summary.timekeeping.alarm
 
 
 @pytest.mark.parametrize("limit", [2.0, 10.0])
@@ -290,7 +290,7 @@ def test_steps_of_an_encoder_are_an_alarm_if_the_force_swings_by_half_its_limit(
     with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock(), limits=limits) as bridge:
         assert bridge.setup.coupling.stiffness == 2400.0
         summary = bridge.run(1.0)
-    assert ("in coarse steps" in summary.timekeeping.fault) == (step == 4e-3)
+    assert ("in coarse steps" in summary.certification.reason) == (step == 4e-3)
 
 
 def test_motion_that_lost_samples_hide_is_no_coarse_step() -> None:
@@ -311,7 +311,7 @@ def test_motion_that_lost_samples_hide_is_no_coarse_step() -> None:
         summary = bridge.run(1.0)
         moved = np.diff(bridge.latest_records(1000)["device_position"][:, 0])
     assert np.abs(moved).max() > 4e-3
-    assert not summary.timekeeping.watch
+    assert not summary.timekeeping.alarm
 
 
 class LateDevice:
@@ -394,7 +394,7 @@ def test_a_motor_that_shakes_the_tool_is_no_alarm(tmp_path: Path, frequency: flo
         )
         force = bridge.latest_records(500)["wrench_on_device"][:, 0]
     assert force.std() >= 3.0
-    assert not summary.timekeeping.watch
+    assert not summary.timekeeping.alarm
 
 
 def sways(amplitude: float, duration: float) -> Motion:
@@ -427,7 +427,7 @@ def test_samples_in_bunches_alone_are_no_alarm(most: int, grip: str) -> None:
 def test_summary_and_audit_say_what_the_watch_did(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     summary = pressed(path, is_watched=True)
-    sentence = summary.timekeeping.fault
+    sentence = summary.certification.reason
     assert sentence.startswith("the force was")
     assert summary.is_certified is False
     report = audit(path)

@@ -35,8 +35,8 @@ from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.kernel import mujoco_c as native
 from hapticbridge.kernel.codes import BAD_RESULT, BAD_SAMPLE, OK, Scheme
 from hapticbridge.kernel.handle import handle_pose
+from hapticbridge.kernel.record import TICK_DTYPE, TickFlag
 from hapticbridge.kernel.tick import HEAD, TAIL, after_step, before_step, publish, simulate
-from hapticbridge.record import TICK_DTYPE, TickFlag
 from hapticbridge.scene import load_scene
 
 TURNED = (0.3, -0.2, 0.1, 0.5, 0.5, -0.5, 0.5)
@@ -420,7 +420,7 @@ def test_binding_keeps_model_and_data_alive() -> None:
 )
 def test_parameters_out_of_range_are_refused_by_name(changes: dict[str, Any]) -> None:
     _, parameters = bind(load(FREE_BALL))
-    name = next(iter(changes)).removesuffix("_ticks").replace("_", ".")
+    name = next(iter(changes)).replace("_", ".")
     with pytest.raises(HapticBridgeError, match=f"{name} is"):
         replace(parameters, **changes)
 

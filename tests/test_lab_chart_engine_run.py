@@ -12,6 +12,7 @@ import pytest
 from engine_tasks import engine_or_skip
 
 from hapticbridge.errors import StudyError
+from hapticbridge.kernel.pose import Vector
 from hapticbridge.lab.chart import chart as chart_module
 from hapticbridge.lab.chart import contact_bodies
 from hapticbridge.lab.chart.chart import Chart, Extent, measure_chart, open_workload
@@ -34,7 +35,6 @@ from hapticbridge.lab.engines.base import (
 )
 from hapticbridge.lab.engines.base import Setting as EngineSetting
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.pose import Vector
 
 GRID, FINE = 4e-3, 1e-3
 

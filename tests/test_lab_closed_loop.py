@@ -13,17 +13,17 @@ import pytest
 from random_hands import random_hand
 
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import conditions_of, default_coupling, is_certified
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import conditions_of, default_coupling, is_certified
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.loop_setting import LoopSetting
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.errors import DeviceError, StudyError
-from hapticbridge.guard import Limits
+from hapticbridge.kernel.record import CLOCK_FIELDS, TICK_DTYPE
 from hapticbridge.lab.closed_loop import PARTS, ClosedLoop, LoopOutcome, Timing
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.loop_setting import LoopSetting
-from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE
+from hapticbridge.run.bridge import Bridge
 from hapticbridge.scene import load_scene
 
 T = 1e-3

@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
+from hapticbridge.kernel.pose import quaternion_exp
 from hapticbridge.lab.engines.base import (
     ENGINES,
     Body,
@@ -38,7 +39,6 @@ from hapticbridge.lab.engines.base import (
     Velocity,
     composed,
 )
-from hapticbridge.pose import quaternion_exp
 from hapticbridge.theory.rigid_body import CoupledStepRule, drive_mass, integrate_rotation
 
 NOTHING = (0.0, 0.0, 0.0)

@@ -17,6 +17,7 @@ from engine_tasks import COUPLING
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.files import install_command
+from hapticbridge.kernel.pose import quaternion_exp
 from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.base import (
     ENGINES,
@@ -32,7 +33,6 @@ from hapticbridge.lab.engines.base import (
     open_engine,
 )
 from hapticbridge.lab.engines.from_scene import task_from_scene
-from hapticbridge.pose import quaternion_exp
 from hapticbridge.scene import Scene, load_scene
 
 SCENE = """

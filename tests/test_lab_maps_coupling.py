@@ -12,9 +12,9 @@ from map_runs import boundary_of
 
 from hapticbridge.audit import audit
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SafetyTrip
-from hapticbridge.guard import Limits
 from hapticbridge.lab.maps import coupling
 from hapticbridge.lab.maps.base import (
     Point,

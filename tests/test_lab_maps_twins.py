@@ -63,7 +63,7 @@ def recorded(
 
 def differences(fails: Recording, safe: Recording) -> dict[str, Any]:
     """Returns the differing metadata of two recordings, and the differing words of their scenes."""
-    names = {*fails.meta, *safe.meta} - DERIVED
+    names = {*fails.meta, *safe.meta} - DERIVED - {"request"}
     found: dict[str, Any] = {
         name: (fails.meta.get(name), safe.meta.get(name))
         for name in names

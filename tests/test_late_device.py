@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import conditions_of, default_coupling
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import conditions_of, default_coupling
+from hapticbridge.demand.loop_setting import LoopSetting
+from hapticbridge.demand.methods import default_method
 from hapticbridge.device import DeviceInfo, Hand, Motion, SimulatedDevice
-from hapticbridge.loop_setting import LoopSetting
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
-from hapticbridge.rendering import default_method
-from hapticbridge.summary import Summary
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.summary import Summary
 from hapticbridge.theory.bounds import (
     NEEDED_SHARE,
     late_minimum_damping,

@@ -15,43 +15,19 @@ TESTS = Path(__file__).parent
 PACKAGE = TESTS.parent / "hapticbridge"
 
 ORDER = (
-    ("errors", "jit", "lazy", "machine_code", "record", "signals", "units", "whole_program"),
-    (
-        "arguments",
-        "clock",
-        "confinement",
-        "coupling",
-        "dataclass_json",
-        "files",
-        "hand_energy",
-        "pose",
-    ),
-    ("recording",),
-    ("kernel", "theory", "plotting", "sweep"),
-    ("scene", "inputs"),
-    ("rendering", "device"),
-    (
-        "loop_setting",
-        "certificate",
-        "identify",
-        "realtime",
-        "rehearsal",
-        "run_description",
-        "slow_scene",
-        "theory_plots",
-    ),
-    ("guard", "summary", "timekeeping", "export", "programs"),
-    ("testing",),
-    ("commands", "check"),
-    ("options",),
-    ("hands",),
-    ("request",),
-    ("recorded_scene",),
-    ("audit", "compare"),
-    ("session", "film_process", "film", "dataset", "report"),
-    ("bridge", "view"),
-    ("whatif",),  # runs the bridge and the audit, which do not depend on each other
-    ("lab",),
+    ("errors", "lazy", "signals", "units"),
+    ("arguments", "confinement", "files"),
+    ("clock", "coupling", "dataclass_json", "plotting", "sweep"),
+    ("kernel",),
+    ("recording", "scene", "theory"),
+    ("device",),
+    ("demand", "testing"),
+    ("realtime",),
+    ("identify", "run"),
+    ("audit", "check"),
+    ("replay", "report"),
+    ("lab", "tools", "view"),
+    ("whatif",),
     ("cli",),
 )
 """Modules and packages directly below hapticbridge. Each imports only from its row and above."""
@@ -107,8 +83,9 @@ def test_concepts_do_not_import_each_other_in_a_circle() -> None:
 
 
 def test_the_audit_never_imports_the_bridge() -> None:
+    loop = {f"hapticbridge.run.{name}" for name in ("bridge", "session", "options")}
     for path in (PACKAGE / "audit").glob("*.py"):
-        assert not {"bridge", "session", "options"} & imported_concepts(path), path.name
+        assert not loop & imported_modules(path), path.name
     for name in (
         "motion",
         "spring",
@@ -117,7 +94,7 @@ def test_the_audit_never_imports_the_bridge() -> None:
     ):  # a second opinion has an arithmetic of its own
         modules = imported_modules(PACKAGE / "audit" / f"{name}.py")
         others = {module for module in modules if not module.startswith("hapticbridge.audit")}
-        assert others <= {"hapticbridge.kernel.parameters", "hapticbridge.record"}, name
+        assert others <= {"hapticbridge.kernel.parameters", "hapticbridge.kernel.record"}, name
 
 
 def test_the_core_never_imports_the_lab() -> None:
@@ -174,7 +151,7 @@ WITH_PRIVATE_NAMES = {
 
 
 def test_no_test_reads_a_private_name() -> None:
-    examples = "device._link.close()\nfrom hapticbridge.jit import _cache"
+    examples = "device._link.close()\nfrom hapticbridge.kernel.jit import _cache"
     assert set(private_names(examples)) == {"device._link", "_cache"}
     offences = [
         f"{path.name}: {name}"
@@ -222,8 +199,8 @@ SMALL = 80
 INTERFACES = {
     "hapticbridge.lazy",  # imported by package files, which are not counted
     "hapticbridge.device.transport.maker_library",  # libraries of makers, for any driver
-    "hapticbridge.programs",  # run by scripts/setup and the builder of wheels too
-    "hapticbridge.whole_program",  # imported when something is compiled, with numba
+    "hapticbridge.run.programs",  # run by scripts/setup and the builder of wheels too
+    "hapticbridge.kernel.whole_program",  # imported when something is compiled, with numba
 }
 """Modules that are small on purpose."""
 
@@ -346,3 +323,100 @@ def test_a_write_to_a_part_of_the_state_is_found(line: str) -> None:
     assert not written_parts(
         "def f(s: State) -> None:\n    slack = s.energy.slack\n    slack = 1.0"
     )
+
+
+MESSAGES = re.compile(
+    "reason|sentence|words|message|remark|cause|clause|fault|concern|remed|problem|hint|finding"
+    "|agreement|resimulation|silence|alarm|slowness"
+)
+"""Names of texts for readers: a name or attribute that holds one has one of these in it."""
+
+READING = {"startswith", "endswith", "partition", "rpartition", "split", "rsplit", "find", "index"}
+READING |= {"removeprefix", "removesuffix", "count"}
+"""Methods by which a program reads a text."""
+
+READ_BACK: set[str] = set()
+"""Places that may read a text for readers; none does."""
+
+
+def name_of_text(node: ast.expr) -> str:
+    """Returns the name behind an expression: ``x.reason[0]``, ``str(reason)``, ``e["reason"]``."""
+    if isinstance(node, ast.Call):
+        inner = node.args or [node.func]
+        is_text = isinstance(node.func, ast.Name) and node.func.id == "str"
+        is_get = isinstance(node.func, ast.Attribute) and node.func.attr == "get"
+        return name_of_text(inner[0]) if is_text or is_get else ""
+    if isinstance(node, ast.Subscript):
+        return name_of_text(node.slice) if is_string(node.slice) else name_of_text(node.value)
+    if isinstance(node, ast.JoinedStr):
+        values = (each.value for each in node.values if isinstance(each, ast.FormattedValue))
+        return " ".join(map(name_of_text, values))
+    if is_string(node):
+        return str(node.value)  # type: ignore[attr-defined] # by the line above
+    name = getattr(node, "attr", getattr(node, "id", ""))
+    return "" if name.isupper() else name
+
+
+def is_string(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
+def read_messages(source: str) -> list[str]:
+    """Returns the expressions that take a text for readers apart, or compare it with another.
+
+    ``split()`` without an argument removes line breaks alone. A text that is all in capitals, and
+    one in a set of names, is a code.
+    """
+    found: list[ast.expr] = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            owner = node.func.value
+            if node.func.attr in READING and node.args and not is_string(owner):
+                found += [node] if MESSAGES.search(name_of_text(owner)) else []
+        elif isinstance(node, ast.Compare):
+            sides = [node.left, *node.comparators]
+            for operator, left, right in zip(node.ops, sides, sides[1:], strict=False):
+                is_equal = isinstance(operator, ast.Eq | ast.NotEq)
+                is_within = isinstance(operator, ast.In | ast.NotIn)
+                texts = [left, right] if is_equal and (is_string(left) or is_string(right)) else []
+                texts += [right] if is_within and (is_string(left) or is_code(left)) else []
+                names = (name_of_text(each) for each in texts if not is_string(each))
+                found += [node] if any(map(MESSAGES.search, names)) else []
+    return [ast.unparse(node) for node in found]
+
+
+def is_code(node: ast.expr) -> bool:
+    return isinstance(node, ast.Name) and node.id.isupper()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        'report.reason.partition("; ")',
+        'report.reason.partition("; ")[0]',
+        'str(stop.get("reason")).startswith("SafetyTrip")',
+        "reason.endswith(_REASONS[code])",
+        "UNKNOWN in self.watch_words",
+        '": K = " in f": {sentence}"',
+        'report.resimulation == "bit for bit"',
+        'event["reason"].split(": ")',
+        'concerns[0].rpartition("; write ")',
+    ],
+)
+def test_a_sentence_that_is_read_back_is_found(line: str) -> None:
+    assert read_messages(line)
+
+
+def test_a_code_is_no_sentence() -> None:
+    for line in ('" ".join(words.split())', "code in reasons", 'mode == "r"', "REASON in found"):
+        assert not read_messages(line), line
+
+
+def test_no_part_of_the_core_reads_a_sentence_back() -> None:
+    offences = [
+        f"{path.relative_to(PACKAGE)}: {text}"
+        for path in FILES
+        if concept(path) != "lab"
+        for text in read_messages(path.read_text(encoding="utf-8"))
+    ]
+    assert set(offences) == READ_BACK

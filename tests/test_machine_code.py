@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hapticbridge import jit, machine_code
-from hapticbridge.jit import Program, compiled, direct, external, prepare
-from hapticbridge.jit import compiled_for_threads as threaded
+from hapticbridge.kernel import jit, machine_code
+from hapticbridge.kernel.jit import Program, compiled, direct, external, prepare
+from hapticbridge.kernel.jit import compiled_for_threads as threaded
 
 PAIR = np.dtype([("first", "<f8"), ("second", "<i8")])
 
@@ -303,7 +303,7 @@ SOURCES = {
     "limits": "RAMP = 0.25\nTABLE = (1.0, 2.0)\n",
     "flags": "import enum\nclass Flag(enum.IntEnum):\n    OPEN = 3\n",
     "inner": """
-from hapticbridge.jit import compiled
+from hapticbridge.kernel.jit import compiled
 import numpy as np
 TURN = np.array([5.0, 6.0])
 @compiled
@@ -311,7 +311,7 @@ def risen(time):
     return 2.0 * time + TURN[1]
 """,
     "outer": """
-from hapticbridge.jit import compiled
+from hapticbridge.kernel.jit import compiled
 from limits import RAMP, TABLE
 from flags import Flag
 from inner import risen
@@ -401,7 +401,7 @@ def test_types_of_one_size_have_code_of_their_own(folder: Path) -> None:
 RUN = """
 import itertools, sys
 import hapticbridge as hb
-from hapticbridge.commands import Couple, Reset, Switch
+from hapticbridge.run.commands import Couple, Reset, Switch
 with hb.Bridge("point_mass", "simulated", clock=hb.SimulatedClock()) as bridge:
     bridge.session.commands.now = itertools.count(1.0).__next__
     bridge.run(0.02)

@@ -15,12 +15,12 @@ from random_hands import T, random_motion, shaken, smooth
 
 import hapticbridge as hb
 from hapticbridge import scene as scenes
-from hapticbridge.certificate import default_coupling
+from hapticbridge.demand.certificate import default_coupling
+from hapticbridge.demand.methods import default_method
 from hapticbridge.device import DEFAULT_HAND, Hand, Motion, SimulatedDevice, device_for, scene_hand
 from hapticbridge.errors import SceneError
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
-from hapticbridge.record import TickFlag
-from hapticbridge.rendering import default_method
 from hapticbridge.scene import scene_names, scene_path
 
 FORCE_LIMIT, TORQUE_LIMIT = 10.0, 0.5  # N and N m, of the default simulated device
@@ -327,9 +327,9 @@ def test_the_hand_is_the_options_then_the_scenes_then_the_default(
     [
         *((numbers, "must be stiffness in N/m and damping")
           for numbers in ("1000", "1000 30 3", "1000 30 3 0.05 1")),
-        ("-1 30", "hand stiffness = -1"),
-        ("1000 nan", "hand damping = nan"),
-        ("1000 30 inf 0.05", "hand rotational_stiffness = inf"),
+        ("-1 30", "hand stiffness is -1.0 N/m"),
+        ("1000 nan", "hand damping is nan N s/m"),
+        ("1000 30 inf 0.05", "hand rotational stiffness is inf N m/rad"),
     ],
 )  # fmt: skip
 def test_numbers_that_are_no_hand_are_refused(numbers: str, says: str, tmp_path: Path) -> None:

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 import itertools
 import math
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, fields, is_dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from hapticbridge.arguments import label, members, rule_of, types_of
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device import AXES, DeviceInfo, Hand, Motion, SimulatedDevice
 from hapticbridge.errors import CouplingError, HapticBridgeError
-from hapticbridge.guard import Limits
-from hapticbridge.kernel.parameters import ENVIRONMENT, GuardParameters
-from hapticbridge.options import BridgeOptions, RunSetup, Workspace
+from hapticbridge.kernel.parameters import ENVIRONMENT, GuardParameters, RunParameters
+from hapticbridge.run import options
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.options import BridgeOptions, RunSetup, Workspace
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.whatif.settings import CHANGEABLE, KEPT
 
@@ -223,3 +226,32 @@ def test_a_what_if_changes_every_option_or_says_why_not() -> None:
     }
     assert every == {*CHANGEABLE, *KEPT, "workspace", "limits"}
     assert all(KEPT.values())
+
+
+UNSET = {"is_beside": "only a slower scene's own loop is"}
+"""Parameters of a run that its setup leaves at their default, each with the reason."""
+
+
+def test_a_setup_sets_every_parameter_of_a_run() -> None:
+    """A parameter that the setup forgets would have its default, whatever the option says."""
+    tree = ast.parse(inspect.getsource(options))
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    [made] = [node for node in calls if ast.unparse(node.func) == "RunParameters"]
+    assert {word.arg for word in made.keywords} == {
+        each.name for each in fields(RunParameters) if each.name not in UNSET
+    }
+
+
+READ_IN_A_LOOP = {"force", "torque"}
+"""Limits that are read by a name in a loop."""
+
+
+@pytest.mark.parametrize("kind", [BridgeOptions, Limits])
+def test_every_option_is_read(kind: Any) -> None:
+    """An option that is declared, recorded and asked for again, but never used, fails here."""
+    package = Path(options.__file__).parents[1]
+    files = (path for name in ("run", "demand") for path in (package / name).glob("*.py"))
+    source = "".join(path.read_text(encoding="utf-8") for path in files)
+    read = set(re.findall(r"\b(?:options|limits)\.(\w+)", source)) | READ_IN_A_LOOP
+    inside = set(re.findall(r"\bself\.(\w+)", inspect.getsource(kind)))
+    assert {each.name for each in fields(kind)} <= read | inside

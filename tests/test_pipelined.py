@@ -16,13 +16,13 @@ from golden_cases import WORKSHOP, runs
 from kernel_runs import FREE_BALL, at_rest
 from kernel_runs import fast as fast_run
 
-from hapticbridge.bridge import Bridge
+from hapticbridge.demand.guard import Limits
 from hapticbridge.errors import SafetyTrip
-from hapticbridge.guard import Limits
-from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import Scheme
 from hapticbridge.kernel.handle import take_actuator_velocities, take_handle_frames
+from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.tick import can_split, is_sound
+from hapticbridge.run.bridge import Bridge
 
 TICKS = 400
 

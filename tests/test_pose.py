@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticbridge import pose
+from hapticbridge.kernel import pose
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 
-from hapticbridge import audit, jit, machine_code
+from hapticbridge import audit
 from hapticbridge.cli import main
-from hapticbridge.programs import programs
+from hapticbridge.kernel import jit, machine_code
+from hapticbridge.run.programs import programs
 
 
 def test_the_first_run_and_its_audit_load_what_was_compiled_ahead(

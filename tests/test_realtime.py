@@ -19,8 +19,8 @@ import pytest
 from audit_cases import ScriptedDevice
 from bridge_runs import fast, sway
 
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import RealClock, SimulatedClock
+from hapticbridge.demand.methods import prepare
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.realtime import (
@@ -36,7 +36,7 @@ from hapticbridge.realtime import realtime as asked
 from hapticbridge.realtime import realtime as pace
 from hapticbridge.realtime.realtime import BESIDE_THE_STEP, CONTAINER, PRIORITY, SHELL, rate_for
 from hapticbridge.recording import read_recording
-from hapticbridge.rendering import prepare
+from hapticbridge.run.bridge import Bridge
 from hapticbridge.scene import load_scene
 from hapticbridge.view.window import Address, Window
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from hapticbridge.cli import main
+from hapticbridge.device.discovery import BlindSpot
 from hapticbridge.device.driver import FoundDevice
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.realtime import Grant, Lateness, real_time, stolen_time
@@ -120,7 +121,7 @@ def test_forbidden_devices_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyP
         product=0xCB48, transport="usb", problem=None,
     )  # fmt: skip
     locked = replace(device, problem="no permission to open /dev/bus/usb/001/004")
-    blind = ["hidapi cannot be loaded: 'pip install'"]
+    blind = [BlindSpot("hidapi cannot be loaded", "pip install")]
     for plugged, spots, is_good, word in (
         ([], [], None, ""),
         ([device], [], True, ""),

@@ -28,16 +28,16 @@ from cli_cases import Called
 
 from hapticbridge import confinement
 from hapticbridge.audit import audit
+from hapticbridge.audit.recorded_scene import compile_recorded
 from hapticbridge.audit.replay import Resimulator
 from hapticbridge.confinement import ForeignSceneError, Worker, in_bounds, unpacked
 from hapticbridge.errors import CouplingError, HapticBridgeError, RecordingError, SceneError
-from hapticbridge.film import Shot, still
-from hapticbridge.recorded_scene import compile_recorded
 from hapticbridge.recording import Recording, open_recording, read_recording
 from hapticbridge.recording.container import MAX_RATIO
+from hapticbridge.replay.film import Shot, still
 from hapticbridge.report.cause import likely_cause
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.run_description import SOURCE_PREFIX
+from hapticbridge.run.description import SOURCE_PREFIX
 from hapticbridge.scene.source import refuse_outside
 from hapticbridge.whatif import what_if
 
@@ -163,7 +163,7 @@ def test_a_crash_of_a_scene_leaves_this_process_alive(
 ) -> None:
     path = rewritten(honest, tmp_path / "a.mcap")
     monkeypatch.setattr(sys.modules[Resimulator.__module__], "Resimulator", crash)
-    monkeypatch.setattr("hapticbridge.film_process.Resimulator", crash)
+    monkeypatch.setattr("hapticbridge.replay.stage.Resimulator", crash)
     with pytest.raises(ForeignSceneError, match=r"crashed MuJoCo \(SIGSEGV\)"):
         OTHERS[way](path)
 

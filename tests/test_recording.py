@@ -27,7 +27,7 @@ from mcap_ros2.decoder import DecoderFactory
 from recording_cases import EPOCH, FILES, META, chunks, random_rows, same, write
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.record import FORMAT, TICK_DTYPE
+from hapticbridge.kernel.record import FORMAT, TICK_DTYPE
 from hapticbridge.recording import Attachment, Recording, RecordingWriter, read_recording, repair
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.container import DamageError, Fields

@@ -20,7 +20,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.record import FORMAT, TICK_DTYPE, TickFlag
+from hapticbridge.kernel.record import FORMAT, TICK_DTYPE, TickFlag
 from hapticbridge.recording import TAIL, Attachment, Recorder, Ring, read_recording
 from hapticbridge.recording import recorder as recorder_module
 from hapticbridge.recording.recorder import RecordStream

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.record import TICK_DTYPE
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.recording import HEAD, TAIL, Ring
 from hapticbridge.recording import ring as ring_module
 

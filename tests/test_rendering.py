@@ -28,22 +28,22 @@ from rendering_runs import (
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import default_coupling, run_conditions
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import default_coupling, run_conditions
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.loop_setting import required_damping
+from hapticbridge.demand.methods import IMPLICIT, check_prepared, method_named, prepare
 from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.errors import CouplingError, DeviceError, HapticBridgeError, SceneError
-from hapticbridge.guard import Limits
 from hapticbridge.kernel.codes import OK, WELD_NAME
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome, Timing
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.loop_setting import required_damping
-from hapticbridge.options import Workspace
 from hapticbridge.recording import read_recording
-from hapticbridge.rendering import IMPLICIT, check_prepared, method_named, prepare
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.options import Workspace
 from hapticbridge.scene import load_scene
 from hapticbridge.theory.rigid_body import exact_mass_response
 from hapticbridge.theory.sampled_loop import WorstHand

@@ -21,14 +21,16 @@ from report_runs import Made
 
 import hapticbridge as hb
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import run_conditions
+from hapticbridge.audit.replay import Agreement
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import run_conditions
+from hapticbridge.demand.certification import Standing
+from hapticbridge.demand.methods import method_named
+from hapticbridge.demand.trip import Trip, TripCode
 from hapticbridge.kernel.parameters import DAMPER
-from hapticbridge.record import TickFlag
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.rendering import method_named
 from hapticbridge.report import write_report
 from hapticbridge.report.cause import Cause, likely_cause
 from hapticbridge.report.evidence import Evidence
@@ -48,6 +50,7 @@ from hapticbridge.report.plots import (
     draw_recording,
     draw_timing,
 )
+from hapticbridge.run.bridge import Bridge
 from hapticbridge.units import format_si
 
 pytestmark = pytest.mark.filterwarnings("ignore:scene '.*(floor|fan).xml'")
@@ -101,12 +104,20 @@ def test_a_page_leads_with_its_verdict_and_shows_a_moment_only_of_a_fault(
         False: "The device does not bear this coupling",
         None: "It is not known if the device bears this coupling in any hand.",
     }
+    found = passive.certification
+    assert found is not None
+    standings = {
+        True: Standing.CERTIFIED,
+        False: Standing.DAMPING,
+        None: Standing.DAMPING_UNKNOWN,
+    }
     for certified, words in sentences.items():
-        judged = replace(passive, certified=certified)
+        judged = replace(passive, certification=replace(found, standing=standings[certified]))
         assert words in notes(judged)[-1]
         assert is_warned(judged) is (certified is False)
     assert not notes(replace(passive, verdict="active"))
-    stopped = replace(passive, reason=f"{passive.reason}; the guard tripped", events={"trip": 1})
+    trip = Trip(TripCode.JUMPED, 3)
+    stopped = replace(passive, remarks=(*passive.remarks, "the guard tripped"), trip=trip)
     write_report(read_recording(run_file), stopped, page)
     text = page.read_text(encoding="utf-8")
     assert '<section class="verdict warned">' in text
@@ -301,7 +312,7 @@ def test_the_scene_is_the_cause_by_what_touched_and_what_was_moved(made: Made) -
     law = json.dumps([float(recording.meta[name]) for name in gains])
     hazardous = recording.meta | {"method": "implicitfast", "requested": law}
     assert cause_of(recording, report, meta=hazardous).kind == "contact setting"
-    foreign = replace(report, resimulation="not re-simulated: recorded with mujoco 3.0.0")
+    foreign = replace(report, agreement=Agreement.NOT_RUN, obstacle="recorded with mujoco 3.0.0")
     cause = cause_of(recording, foreign)
     assert (cause.kind, "touched" in cause.evidence) == ("contact setting", False)
     recording, report = made(report_runs.active_by_mocap)

@@ -16,15 +16,15 @@ from two_hands import TONGS
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.dataclass_json import from_json, to_json
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device import GrippingDevice
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.guard import Limits
-from hapticbridge.hands import Grasp, GripAxis
-from hapticbridge.options import BridgeOptions, Workspace
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.request import RunRequest, request_of, setups_of
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.hands import Grasp, GripAxis
+from hapticbridge.run.options import BridgeOptions, Workspace
+from hapticbridge.run.request import RunRequest, request_of, setups_of
 from hapticbridge.whatif import what_if
 from hapticbridge.whatif.recorded import RecordedRun, changed_request
 

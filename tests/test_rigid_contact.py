@@ -13,16 +13,16 @@ import pytest
 from kernel_runs import Array, Run, T, go_on, load, run_of, samples_of, unlimited
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import METHODS, prepare
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
-from hapticbridge.options import BridgeOptions
-from hapticbridge.record import TICK_DTYPE
-from hapticbridge.rendering import METHODS, prepare
-from hapticbridge.run_description import method_of
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.description import method_of
+from hapticbridge.run.options import BridgeOptions
 from hapticbridge.scene import Scene, load_scene
 
 BETA, SPENDABLE = 0.2, 0.9  # of the law, written down anew
@@ -674,7 +674,7 @@ def test_contact_of_the_scene_restores_what_rigid_contact_changed() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"contact": "soft"}, "no contact is called 'soft'; contacts: 'rigid', 'scene'"),
+        ({"contact": "soft"}, "contact is 'soft'; it must be one of 'rigid', 'scene'"),
         ({"contact": "rigid", "method": "weld"}, "'weld' has the contacts of the scene"),
         (
             {"contact": "rigid", "method": "explicit:rk4"},
@@ -689,10 +689,9 @@ def test_a_contact_that_a_method_cannot_have_is_refused(
         BridgeOptions(**changes)  # type: ignore[arg-type] # names are checked there
 
 
-def test_methods_for_comparison_and_earlier_recordings_have_the_contact_of_the_scene() -> None:
+def test_methods_for_comparison_have_the_contact_of_the_scene() -> None:
     assert BridgeOptions(method="weld").rendering_method.contact == "scene"
     assert BridgeOptions().rendering_method.contact == "rigid"
-    assert method_of({"method": "lossless"}).contact == "scene"
     assert method_of({"method": "lossless", "contact": "rigid"}).contact == "rigid"
 
 

@@ -14,14 +14,14 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import METHODS, prepare
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import contact_rigs as rigs
 from hapticbridge.lab.maps.base import loop_in
 from hapticbridge.lab.maps.contact_rigs import COMPARED_RIGS, Case, run_case
-from hapticbridge.record import TICK_DTYPE
-from hapticbridge.rendering import METHODS, prepare
 
 FREE = [name for name in COMPARED_RIGS if not rigs.RIGS[name].is_shipped]
 SHIPPED = [name for name in COMPARED_RIGS if rigs.RIGS[name].is_shipped]

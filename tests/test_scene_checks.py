@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
 from hapticbridge.device import Motion, SimulatedDevice
-from hapticbridge.inputs import input_writes
 from hapticbridge.kernel.codes import (
     COUPLING_ACTUATORS,
     HANDLE,
@@ -26,6 +25,7 @@ from hapticbridge.kernel.codes import (
     coupling_ids,
 )
 from hapticbridge.scene import load_scene, scene_names, scene_path
+from hapticbridge.scene.inputs import input_writes
 
 
 def test_missing_file_name_and_folder_are_told_apart(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from outside_scenes import hand_file, scene_file
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
-from hapticbridge.rehearsal import holding_force, loaded_handle, static_load
+from hapticbridge.scene.rehearsal import holding_force, loaded_handle, static_load
 
 Array = NDArray[np.float64]
 Stops = list[tuple[float, tuple[float, float, float]]]

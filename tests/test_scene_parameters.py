@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 import hapticbridge as hb
 from hapticbridge import scene as scenes
+from hapticbridge.audit.recorded_scene import compile_recorded, is_as_recorded
 from hapticbridge.cli import main
-from hapticbridge.recorded_scene import compile_recorded, is_as_recorded
-from hapticbridge.run_description import compiled_model
+from hapticbridge.run.description import compiled_model
 from hapticbridge.scene import load_scene, scene_path
 
 PARAMETERS = [

@@ -18,7 +18,7 @@ from outside_scenes import RICH, mjcf, obj_bytes, png_bytes, scene_file, stl_byt
 
 from hapticbridge.audit import audit
 from hapticbridge.errors import SceneError
-from hapticbridge.run_description import compiled_model
+from hapticbridge.run.description import compiled_model
 from hapticbridge.scene import load_scene
 from hapticbridge.scene.source import read_elements
 

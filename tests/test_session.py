@@ -8,11 +8,11 @@ from bridge_runs import still, sway
 
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.errors import HapticBridgeError, SceneError
-from hapticbridge.hands import Grasp
-from hapticbridge.options import BridgeOptions
-from hapticbridge.request import RunRequest
+from hapticbridge.run.hands import Grasp
+from hapticbridge.run.options import BridgeOptions
+from hapticbridge.run.request import RunRequest
+from hapticbridge.run.session import RecordOutput, Session, StopRequest
 from hapticbridge.scene import load_scene
-from hapticbridge.session import RecordOutput, Session, StopRequest
 
 
 def test_a_session_runs_without_a_bridge_and_releases_what_it_holds() -> None:

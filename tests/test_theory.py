@@ -14,8 +14,8 @@ from hapticbridge import theory as m
 from hapticbridge import theory as p
 from hapticbridge.arguments import LARGEST, SMALLEST
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.plots import alternatives
 from hapticbridge.errors import CouplingError, HapticBridgeError, MechanicsError
-from hapticbridge.theory_plots import alternatives
 
 T = 1e-3
 COUPLING = Coupling(1000, 1, 1, 1e-3)

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.plots import alternatives
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.plotting import check_ending, new_figure, write_picture
-from hapticbridge.theory_plots import alternatives
 
 T = 1e-3
 

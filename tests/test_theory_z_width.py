@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from hapticbridge.certificate import default_coupling
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import default_coupling
+from hapticbridge.demand.methods import default_method
 from hapticbridge.device import open_device
 from hapticbridge.errors import CouplingError
-from hapticbridge.rendering import default_method
 from hapticbridge.theory.bounds import minimum_damping, worst_frequency
 from hapticbridge.theory.transfer import CouplingGrid
 from hapticbridge.theory.z_width import (
@@ -124,7 +124,7 @@ def test_with_delay_line_is_where_wall_meets_device(b: float, delay: int, tau: f
     assert z.limit[0] == pytest.approx(b / (T * (delay + 0.5)), rel=1e-6)
     assert z.limit[-1] == 0
     assert set(z.limited_by) == {WALL}
-    assert "of every scene" in z.notes[0]
+    assert "holds for every scene" in z.notes[0]
 
 
 OUT_OF_RANGE: list[tuple[Callable[[Any], Any], str]] = [

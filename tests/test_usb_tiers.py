@@ -13,7 +13,7 @@ from emulated.guest import NO_KERNEL, GuestRun, kernel, run_in_guest
 from emulated.parting import parting, repeated
 from emulated.tiers import JOBS, Claim, Job, claims_of, main
 
-from hapticbridge.record import COLUMNS, TICK_DTYPE
+from hapticbridge.kernel.record import COLUMNS, TICK_DTYPE
 from hapticbridge.recording.writer import RecordingWriter
 
 

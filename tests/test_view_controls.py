@@ -20,12 +20,12 @@ from test_bridge_commands import FLOOR, STEPS, swaying
 from test_commands import allowance
 
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
-from hapticbridge.commands import Couple, Stop, Switch, command_of
+from hapticbridge.demand.guard import Limits
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
-from hapticbridge.guard import Limits
 from hapticbridge.recording import read_recording
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.commands import Couple, Stop, Switch, command_of
 from hapticbridge.view.window import Address, Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")

@@ -16,11 +16,11 @@ from view_cases import AT_ONCE, FLOOR, Canvas, pressed
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.errors import RecordingError
-from hapticbridge.film_process import Stage
 from hapticbridge.recording import Attachment, Ring, read_recording
 from hapticbridge.recording.ring import Snapshot
+from hapticbridge.replay.stage import Stage
+from hapticbridge.run.bridge import Bridge
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 

@@ -20,8 +20,8 @@ from view_cases import pressed_floor
 
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.files import install_command
-from hapticbridge.film_process import Stage
 from hapticbridge.recording import read_recording
+from hapticbridge.replay.stage import Stage
 from hapticbridge.view.window import Address
 
 pytest.importorskip("viser", reason="needs the extra 'view'")

@@ -11,8 +11,8 @@ import types
 
 import pytest
 
-from hapticbridge.commands import Command, Couple, Stop, Switch, line_of
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.run.commands import Command, Couple, Stop, Switch, line_of
 from hapticbridge.view.window import Address, Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")

@@ -36,8 +36,8 @@ DAEMON = "a thread that ends with its process; nothing waits for it"
 
 REASONS = {
     # the loop
-    "bridge.py: wait()": "a clock's: at most one period",
-    "guard.py: clock.wait()": "a clock's: at most one period",
+    "run/bridge.py: wait()": "a clock's: at most one period",
+    "demand/guard.py: clock.wait()": "a clock's: at most one period",
     "identify/identify.py: clock.wait()": "a clock's: at most one period",
     "identify/z_width.py: self.clock.wait()": "a clock's: at most one period",
     "realtime/doctor.py: wait()": "a clock's: at most one period",
@@ -83,7 +83,7 @@ REASONS = {
     "sweep.py: pool.shutdown(wait=True, cancel_futures=True)": USERS,
     "sweep.py: barrier.wait()": "a worker ends with its parent",
     "sweep.py: connection.wait([parent.sentinel])": DAEMON,
-    "compare.py: for line in stream": "no wait: records of a file",
+    "tools/compare.py: for line in stream": "no wait: records of a file",
     "testing/device_contract.py: bench.clock.wait()": "a clock's: at most one period",
     "testing/device_contract.py: self.clock.wait()": "a clock's: at most one period",
 }

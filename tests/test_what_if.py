@@ -20,16 +20,16 @@ from cli_cases import Called
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.bridge import Bridge
-from hapticbridge.commands import Command, Couple, Reset, Switch
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device import DeviceInfo, Hand, Motion, SimulatedDevice
 from hapticbridge.errors import RecordingError, SafetyTrip
-from hapticbridge.guard import Limits
-from hapticbridge.options import Workspace
-from hapticbridge.record import TICK_DTYPE, TickFlag
+from hapticbridge.kernel.record import TICK_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
-from hapticbridge.run_description import SOURCE_PREFIX
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.commands import Command, Couple, Reset, Switch
+from hapticbridge.run.description import SOURCE_PREFIX
+from hapticbridge.run.options import Workspace
 from hapticbridge.scene import load_scene
 from hapticbridge.units import format_si
 from hapticbridge.whatif import WhatIf, WhatIfRun, what_if, write_what_if
@@ -121,7 +121,7 @@ def commanded(bridge: Bridge, tick: int) -> None:
 
 def test_commands_are_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("INTERVAL", "RESET_INTERVAL"):  # no time passes between them
-        monkeypatch.setattr(f"hapticbridge.commands.{name}", 0.0)
+        monkeypatch.setattr(f"hapticbridge.run.commands.{name}", 0.0)
     path, motion = tmp_path / "run.mcap", tmp_path / "tap.csv"
     motion.write_text(TAP)
     device = f"simulated:path={motion}"
@@ -434,11 +434,11 @@ def test_a_trip_is_shown_beside_what_does_not_trip(tmp_path: Path) -> None:
             path, scene, device, duration=0.3, limits=Limits(force=10.0, torque=0.5, stretch=0.005)
         )
     same = what_if(path, {}).runs
-    assert same[1].trip == same[0].trip
+    assert same[1].report.trip == same[0].report.trip
     assert len(same[1].ticks) == len(same[0].ticks)
     found = what_if(path, {"stiffness": 100, "damping": 0.2})
-    assert "stretch limit" in found.runs[0].trip
-    assert "stretch limit" in found.runs[1].trip
+    assert "stretch limit" in str(found.runs[0].report.trip)
+    assert "stretch limit" in str(found.runs[1].report.trip)
     assert found.exit_code == 1
     tripped = len(found.runs[0].ticks)
     # a softer spring is as long sooner

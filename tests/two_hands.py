@@ -9,11 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.jit import compiled
+from hapticbridge.demand.methods import Method, method_named, prepare
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.force_level import keep_state, limited_wrench_after_step
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.ledger import meter_ports
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
+from hapticbridge.kernel.pose import dot
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.state import BoundHands
 from hapticbridge.kernel.tick import (
     active_contacts,
@@ -24,9 +27,6 @@ from hapticbridge.kernel.tick import (
     send_wrench,
     whole_tick,
 )
-from hapticbridge.pose import dot
-from hapticbridge.record import SAMPLE_DTYPE
-from hapticbridge.rendering import Method, method_named, prepare
 from hapticbridge.scene import Scene, load_scene
 
 BAR = """

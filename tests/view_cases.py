@@ -9,7 +9,7 @@ from typing import Any
 from audit_cases import ScriptedDevice
 from report_runs import LOOSE, made_in
 
-from hapticbridge.guard import Limits
+from hapticbridge.demand.guard import Limits
 
 FLOOR = """<mujoco model="floor">
   <option timestep="0.001" integrator="discrete" cone="elliptic" gravity="0 0 0"/>

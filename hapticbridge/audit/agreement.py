@@ -16,11 +16,11 @@ import numpy as np
 
 from hapticbridge.audit.structure import Fault
 from hapticbridge.audit.timing import TimingTally
+from hapticbridge.demand.trip import BY_TRIP
 from hapticbridge.files import read_json
 from hapticbridge.kernel.parameters import GuardParameters
 from hapticbridge.recording import RecordingFile
-from hapticbridge.request import refused_request, request_of, setups_of
-from hapticbridge.run_description import (
+from hapticbridge.run.description import (
     SOURCE_PREFIX,
     STATE_ATTACHMENT,
     metas_of,
@@ -28,6 +28,7 @@ from hapticbridge.run_description import (
     sample_at,
     start_state,
 )
+from hapticbridge.run.request import refused_request, request_of, setups_of
 from hapticbridge.scene import Scene
 
 _TOLERANCE = 1e-9  # relative and absolute in SI units, for numbers of another processor
@@ -140,7 +141,7 @@ def event_statements(recording: RecordingFile, timing: TimingTally) -> Iterator[
         if type(tick) is not int or not 0 <= tick <= count:
             name = f"tick of the event '{event.get('event')}'"
             yield Statement(name, tick, f"0 to {count}", "the records")
-    has_tripped = str(stop.get("reason")).startswith(("SafetyTrip: ", "trip"))
+    has_tripped = stop.get("reason") == BY_TRIP
     if has_tripped:
         yield Statement("event 'trip'", names["trip"] > 0, True, "reason of the event 'stop'")
     for name, counted in (

@@ -8,7 +8,6 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -76,7 +75,7 @@ def audit_all(
     ``AuditReport.margin``. A cut file is judged on the part that remains.
 
     Columns beside ``file``: ``margin``, ``verdict`` (also ``unreadable``), ``environment``,
-    ``certified`` (yes, no or unknown), ``exit_code``, the other fields of ``AuditReport``, the
+    ``certified`` (yes, no or not judged), ``exit_code``, the other fields of ``AuditReport``, the
     energies at the end in J, and ``report``, the whole report as JSON (empty if unreadable).
 
     Args:
@@ -142,10 +141,10 @@ def audit_point(
             "exit_code": 2,
             "reason": str(error)[:_LONGEST_REASON],
         }
-    report = replace(report, reason=report.reason[:_LONGEST_REASON])
     known: dict[str, Value] = {name: getattr(report, name) for name in _COLUMNS}
+    known["reason"] = report.reason[:_LONGEST_REASON]
     known["environment"] = report.environment or ""
-    known["certified"] = {True: "yes", False: "no", None: "unknown"}[report.certified]
+    known["certified"] = report.answer
     if report.damping_margin is not None:
         known["damping_margin"] = report.damping_margin
     if report.tick is not None:

@@ -8,21 +8,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.commands import bits_in, concerns, coupling_in, tuning_ticks
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import conditions_of
+from hapticbridge.demand.loop_setting import LoopSetting, delay_ticks
+from hapticbridge.demand.methods import Method, RunCoupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.loop_setting import LoopSetting, delay_ticks
-from hapticbridge.record import TICK_DTYPE
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.recording import RecordingFile
-from hapticbridge.rendering import Method, RunCoupling
-from hapticbridge.run_description import STARTS, meta_start, method_of, parameters_of
+from hapticbridge.run.commands import bits_in, concerns, coupling_in, tuning_ticks
+from hapticbridge.run.description import STARTS, meta_start, method_of, parameters_of
 
 Array = NDArray[np.float64]
 
@@ -163,15 +165,21 @@ class AuditedRun:
     def worst(self) -> RunParameters:
         """Run parameters with the most demanding coupling, per kind of axis.
 
-        The required damping is convex in the coupling, so no intermediate coupling needs more.
+        It leaves the smallest share of damping or of friction. Both requirements are convex in the
+        coupling, so no intermediate coupling needs more.
         """
         run, couplings = self.parameters, self.events.couplings
         if len(couplings) == 1:
             return run
         loop = LoopSetting.of_run(self.info, run, self.method)
-        needs = [replace(loop, law=coupling).needs() for coupling in couplings]
+
+        def demand(coupling: Coupling, axis: str) -> tuple[float, float]:
+            found = conditions_of(replace(loop, law=coupling))
+            own = [(-each.margin, each.needed) for each in found if each.axis == axis]
+            return max(own, default=(0.0, 0.0))
+
         linear, angular = (
-            couplings[int(np.argmax([need[axis] for need in needs]))] for axis in (0, 1)
+            max(couplings, key=partial(demand, axis=axis)) for axis in ("translation", "rotation")
         )
         coupling = replace(
             linear,
@@ -234,6 +242,7 @@ class AuditState:
         row: Record of the previous tick, (1,). Before the first tick it holds the poses at the
             start and zeros.
         since_sample: Time in s that the device has been without a new sample.
+        stale_ticks: Ticks that the device has been without a new sample.
         rise_ticks: Ticks in which the share of the wrench rises from 0 to 1.
         start_energy: Kinetic plus potential energy before the first tick, in J.
         sums: Cumulative energies in J, by the names of ``SUMS``.
@@ -241,6 +250,7 @@ class AuditState:
 
     row: NDArray[np.void]
     since_sample: float
+    stale_ticks: int
     rise_ticks: float
     start_energy: float
     sums: dict[str, float]
@@ -264,6 +274,7 @@ class AuditState:
         return cls(
             row=row,
             since_sample=0.0,
+            stale_ticks=0,
             rise_ticks=float(parameters.ramp_ticks),
             start_energy=float(starts["start_kinetic"][0] + starts["start_potential"][0]),
             sums=dict.fromkeys(SUMS, 0.0),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.events import AuditState, RunEvents
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.record import TickFlag, has_flag
+from hapticbridge.kernel.record import TickFlag, has_flag
 
 Array = NDArray[np.float64]
 

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from enum import StrEnum
 from typing import Any
 
 import mujoco
@@ -15,21 +16,21 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.agreement import first_contradiction, scene_statements
 from hapticbridge.audit.events import AuditedRun
+from hapticbridge.audit.recorded_scene import bounds_for, compile_recorded, is_as_recorded
 from hapticbridge.audit.structure import first_row
-from hapticbridge.commands import CHANGES as COMMANDED
-from hapticbridge.commands import EventApplier
 from hapticbridge.confinement import Confined, Unlimited, Worker
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
 from hapticbridge.kernel.codes import WARNINGS
 from hapticbridge.kernel.mujoco_c import quiet, warning_of, without_timers
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.record import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.kernel.state import BoundHands, BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
-from hapticbridge.record import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
-from hapticbridge.recorded_scene import bounds_for, compile_recorded, is_as_recorded
 from hapticbridge.recording import RecordingFile
-from hapticbridge.run_description import (
+from hapticbridge.run.commands import CHANGES as COMMANDED
+from hapticbridge.run.commands import EventApplier
+from hapticbridge.run.description import (
     SOURCE_PREFIX,
     STARTS,
     STATE_ATTACHMENT,
@@ -40,9 +41,9 @@ from hapticbridge.run_description import (
     start_of,
     versions,
 )
+from hapticbridge.run.slow_scene import SlowScene
 from hapticbridge.scene import Scene
 from hapticbridge.scene.compile import clause
-from hapticbridge.slow_scene import SlowScene
 
 # Attached scene
 
@@ -286,7 +287,15 @@ def obstacle(recording: RecordingFile) -> str:
 
 # Comparison
 
-NOT_RUN = "not re-simulated"
+
+class Agreement(StrEnum):
+    """Outcome of a re-simulation."""
+
+    EXACT = "bit for bit"
+    NEAR = "within 1e-9 (other processor)"
+    DISAGREES = "disagrees"
+    NOT_RUN = "not re-simulated"
+
 
 _EXTERNAL = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE | TickFlag.STALE_SAMPLE)
 """Flags set by clock, recorder and device instead of the simulation."""
@@ -297,24 +306,20 @@ class ReplayOutcome:
     """Outcome of a re-simulation.
 
     Attributes:
-        agreement: ``bit for bit``, ``within 1e-9 (other processor)``, ``disagrees``, or ``not
-            re-simulated: …`` with the reason.
+        agreement: Outcome.
+        obstacle: Reason why there was no re-simulation; empty if there was one.
         tick: First tick that disagrees, or None.
         field: First field of that tick that disagrees.
         difference: Size of the disagreement.
         warning: Reason for which MuJoCo's warnings stop the run there; empty without one.
     """
 
-    agreement: str
+    agreement: Agreement
+    obstacle: str = ""
     tick: int | None = None
     field: str = ""
     difference: float = 0.0
     warning: str = ""
-
-    @property
-    def has_run(self) -> bool:
-        """True if there was a re-simulation."""
-        return not self.agreement.startswith(NOT_RUN)
 
     @property
     def disagrees(self) -> bool:
@@ -359,7 +364,7 @@ def comparison(
     """
     recording, parameters = hands[0].recording, hands[0].run.parameters
     if reason := obstacle(recording):
-        yield lambda: ReplayOutcome(f"{NOT_RUN}: {reason}")
+        yield lambda: ReplayOutcome(Agreement.NOT_RUN, reason)
         return
     if is_trusted:
         yield lambda: _compared(hands, Unlimited())
@@ -369,7 +374,11 @@ def comparison(
         f"the scene of '{recording.path}'",
         **bounds_for(recording, parameters),
     ) as child:
-        yield lambda: ReplayOutcome(**child.result())
+        yield lambda: _received(child.result())
+
+
+def _received(result: dict[str, Any]) -> ReplayOutcome:
+    return ReplayOutcome(**result | {"agreement": Agreement(result["agreement"])})
 
 
 def _compared(hands: Sequence[AuditedHand], worker: Worker) -> ReplayOutcome:
@@ -378,7 +387,7 @@ def _compared(hands: Sequence[AuditedHand], worker: Worker) -> ReplayOutcome:
     try:
         scene = attached_scene(recording)
     except ForeignModelError as error:
-        return ReplayOutcome(f"{NOT_RUN}: {error}")
+        return ReplayOutcome(Agreement.NOT_RUN, str(error))
     worker.allow_run()
     run = Resimulator(recording, parameters, scene, others)
     is_exact = is_same_processor(recording)
@@ -407,12 +416,12 @@ def _compared(hands: Sequence[AuditedHand], worker: Worker) -> ReplayOutcome:
             break
     run.finish()
     if first is None and run.is_over:
-        return ReplayOutcome(
-            "disagrees", run.done, "tool_position", math.nan, WARNINGS.get(warning_of(run.data), "")
-        )
+        warning = WARNINGS.get(warning_of(run.data), "")
+        off_now = run.done, "tool_position", math.nan, warning
+        return ReplayOutcome(Agreement.DISAGREES, "", *off_now)
     if first is None:
-        return ReplayOutcome("bit for bit")
+        return ReplayOutcome(Agreement.EXACT)
     worst = max(off[name] / max(largest[name], 1.0) for name in names)
     if not run.is_over and not is_same_processor(recording) and worst <= FOREIGN_TOLERANCE:
-        return ReplayOutcome("within 1e-9 (other processor)")
-    return ReplayOutcome("disagrees", *first)
+        return ReplayOutcome(Agreement.NEAR)
+    return ReplayOutcome(Agreement.DISAGREES, "", *first)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from hapticbridge.audit.events import RunEvents
 from hapticbridge.kernel.codes import CLUTCHED, FORCE_OFF
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, RunParameters
+from hapticbridge.kernel.record import CLOCK_FIELDS, TickFlag, has_flag
 from hapticbridge.kernel.tick_guard import DEVICE_BUTTONS
-from hapticbridge.record import CLOCK_FIELDS, TickFlag, has_flag
 from hapticbridge.recording import RecordingFile
 
 Flags = NDArray[np.bool_]

@@ -4,12 +4,13 @@ It is ``kernel.timing`` over whole blocks, from recorded times and poses alone. 
 between two samples, t_d the time from the last sample to its force, d the handle's motion with the
 device and N = K T/2 + B', the energy of each kind of axis is
 
-    A_k = max(0, A_{k−1} + 3 (K/2)²/(N/T) (t_d/τ_k) max(d_k², d_{k−1}²) − p_k)
+    A_k = max(0, A_{k−1} + 3 m (K/2)²/(N/T) (t_d/τ_k) max(d_k², d_{k−1}²) − p_k)
 
-p is what the device's damping burned beyond N, less what it paid for late samples and for a torque
-across the motion (``kernel.law.twist_price``). To it comes what
-late samples cost and the springs could not pay, C_k = max(0, C_{k−1} + c_k − V_k), up to what the
-wrenches gave the hand beyond what b burned; V is the energy of the springs after the sample.
+with k over samples and m ticks since the last one. p is what the device's damping burned beyond
+N, less what it paid for late samples (``kernel.law.charge_lateness``) and for a torque across the
+motion (``kernel.law.twist_price``). To it comes what late samples cost and springs could not pay,
+C_k = max(0, C_{k−1} + c_k − V_k), up to what the wrenches gave the hand beyond what b burned; V is
+the energy of the springs after the sample.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ from numpy.typing import NDArray
 from hapticbridge.audit.events import RunEvents
 from hapticbridge.audit.motion import Array, torque_across, turn_between
 from hapticbridge.audit.spring import springs
-from hapticbridge.audit.wrench_limits import AuditedBlock
+from hapticbridge.audit.wrench_limits import AuditedBlock, newest
 from hapticbridge.kernel.codes import Scheme
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.record import TickFlag, has_flag
+from hapticbridge.kernel.record import TickFlag, has_flag
 
 _DELAY_PRICE = 3.0  # damping in (K T/2)²/N that a delay of a period needs
 
@@ -56,9 +57,10 @@ class TimingTally:
         max_uncovered: Largest energy in J that delays may have given to the hand.
         lent: Energies in J that late samples cost and b has not burned yet, by kind of axis.
         uncovered: Energies A in J by kind of axis.
-        last_square: Squared motions of the last tick, by kind of axis.
+        last_square: Squared motions of the last sample, by kind of axis.
         owed: Energies C in J by kind of axis.
         burned: Energy in J that the device's damping has burned at least.
+        tool_then: Pose of the tool after the tick of the last new sample, (1, 7).
     """
 
     parameters: RunParameters
@@ -80,6 +82,7 @@ class TimingTally:
     last_square: Array = field(default_factory=_no_energy)
     owed: Array = field(default_factory=_no_energy)
     burned: float = 0.0
+    tool_then: Array = field(default_factory=lambda: np.zeros((1, 7)))
 
     def add(self, block: AuditedBlock, events: RunEvents) -> None:
         """Adds consecutive records, at least one."""
@@ -102,9 +105,15 @@ class TimingTally:
         self.delays += float(np.sum(delay[1:]))
         lateness = 1e-9 * (rows["read_ns"] - rows["deadline_ns"])
         self.jitter += float(np.sum(np.maximum(np.diff(lateness), 0.0)))
-        if not parameters.has_law:
-            return
-        elapsed = np.maximum(1e-9 * np.diff(rows["read_ns"]), parameters.period)
+        if parameters.has_law:
+            self._add_energies(block, events, delay)
+
+    def _add_energies(self, block: AuditedBlock, events: RunEvents, delay: Array) -> None:
+        """Adds what late samples and forces may have given; ``delay`` begins with the last tick."""
+        ticks, parameters = block.ticks, self.parameters
+        is_stale = has_flag(ticks, TickFlag.STALE_SAMPLE)
+        is_new = np.concatenate([[True], ~is_stale | block.is_first])
+        waited, stretched = block.sample_ticks - 1, self._stretched(block)
         scale, force_scale = parameters.scale, parameters.force_scale
         linear, angular = parameters.device_damping, parameters.device_rotational_damping
         motion, total, owed = block.motion, np.zeros(len(ticks)), np.zeros(len(ticks))
@@ -118,25 +127,41 @@ class TimingTally:
             square = np.where(block.is_first, 0.0, np.sum(steps**2, axis=1))
             needed = 0.5 * gains[:, 0] + gains[:, 1] / parameters.period
             across = _price_across(block, events) if kind else 0.0
-            late = (
-                needed + across - np.maximum(b, needed * parameters.period) / block.interval
-            ) * square
-            lent = np.concatenate([self.lent[kind : kind + 1], _drained(late, self.lent[kind])])
             half = 0.5 * gains[:, 0]
             price = np.divide(half**2, needed, out=np.zeros_like(half), where=needed > 0)
-            last = np.concatenate([self.last_square[kind : kind + 1], square[:-1]])
-            cost = _DELAY_PRICE * price * delay[:-1] / elapsed * np.maximum(square, last)
-            cost = np.where(block.is_first, 0.0, cost)
+            burnt = np.maximum(b, needed * parameters.period) / block.interval
+            late = (needed + across - burnt) * square
+            more = gains[:, 0] * np.sum(stretched[kind] * steps, axis=1)
+            more -= needed * np.sum(stretched[kind] ** 2, axis=1) / np.maximum(waited, 1)
+            late += np.where((waited > 0) & ~block.is_first, np.maximum(more, 0.0), 0.0)
+            lent = np.concatenate([self.lent[kind : kind + 1], _drained(late, self.lent[kind])])
+            squares = np.concatenate([self.last_square[kind : kind + 1], square])
+            at = np.maximum.accumulate(np.where(is_new, np.arange(len(squares)), 0))
+            last = squares[at[:-1]]
+            cost = _DELAY_PRICE * block.sample_ticks * price * delay[:-1] / block.interval
+            cost = np.where(is_stale | block.is_first, 0.0, cost * np.maximum(square, last))
             energy = _drained(cost + np.minimum(lent[:-1] + late, 0.0), self.uncovered[kind])
             total += energy
             paid = both[kind].energy(pulled[kind])
             debt = _drained(np.where(gains[:, 0] > 0, late - paid, 0.0), self.owed[kind])
             owed += debt
             self.lent[kind], self.uncovered[kind] = lent[-1], energy[-1]
-            self.last_square[kind], self.owed[kind] = square[-1], debt[-1]
+            self.last_square[kind], self.owed[kind] = squares[at[-1]], debt[-1]
         ratio = force_scale / scale
         held = np.minimum(ratio * owed, np.maximum(ticks["device_energy"] - self._burn(block), 0.0))
         self.max_uncovered = max(self.max_uncovered, float(np.max(ratio * total + held)))
+
+    def _stretched(self, block: AuditedBlock) -> tuple[Array, Array]:
+        """Returns how far the tool moved off since the last new sample, (n, 3) in m and rad."""
+        poses = np.concatenate([self.tool_then, block.motion.tool_before])
+        rows, begun = np.arange(len(block.ticks) + 1), np.append(newest(block.is_first), -1)
+        begun[-1] = begun[-2]
+        stale = has_flag(block.ticks[-1:], TickFlag.STALE_SAMPLE)[0]
+        count = np.append(block.sample_ticks, 1 + block.sample_ticks[-1] * stale)
+        then = poses[np.clip(np.maximum(rows - count + 1, begun) + 1, 0, len(poses) - 1)]
+        self.tool_then, then = then[-1:], then[:-1]
+        now = block.motion.tool_before
+        return then[:, :3] - now[:, :3], turn_between(now[:, 3:], then[:, 3:])
 
     def _burn(self, block: AuditedBlock) -> Array:
         """Returns the energy that the device's damping has burned at least by each tick, (n,)."""

@@ -20,7 +20,7 @@ from hapticbridge.audit.agreement import (
 )
 from hapticbridge.audit.energy import EnergyBalance, energy_balances, energy_deviations
 from hapticbridge.audit.events import AuditedRun, AuditState, RunEvents
-from hapticbridge.audit.replay import AuditedHand, ReplayOutcome, comparison
+from hapticbridge.audit.replay import Agreement, AuditedHand, ReplayOutcome, comparison
 from hapticbridge.audit.structure import (
     TOLERANCE,
     Fault,
@@ -30,24 +30,25 @@ from hapticbridge.audit.structure import (
 )
 from hapticbridge.audit.timing import TimingTally
 from hapticbridge.audit.wrench_limits import AuditedBlock, wrench_deviations
-from hapticbridge.certificate import (
+from hapticbridge.demand.certificate import (
     condition_sentences,
     damping_margin,
     is_run_certified,
     run_conditions,
-    worst_verdict,
 )
+from hapticbridge.demand.certification import Certification, certification_of, worst_certification
+from hapticbridge.demand.loop_setting import fresh_share
+from hapticbridge.demand.methods import Method, RunCoupling
+from hapticbridge.demand.timekeeping import RunTimes, Timekeeping
+from hapticbridge.demand.trip import BY_TRIP, Trip
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import finite_or_null
-from hapticbridge.hand_energy import INSTANT, HandEnergy, worst_of
-from hapticbridge.loop_setting import fresh_share
-from hapticbridge.record import CLOCK_FIELDS
+from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
+from hapticbridge.kernel.record import CLOCK_FIELDS
 from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
-from hapticbridge.rendering import Method, RunCoupling
-from hapticbridge.run_description import meta_start, requested_of
-from hapticbridge.summary import Environment, was_never_lossless
-from hapticbridge.timekeeping import RunTimes, Timekeeping
+from hapticbridge.run.description import meta_start, requested_of
+from hapticbridge.run.summary import Environment, was_never_lossless
 from hapticbridge.units import format_energy
 
 Verdict = Literal["passive", "unverified", "active", "invalid"]
@@ -62,17 +63,17 @@ class AuditReport:
         verdict: ``passive``, ``active`` or ``invalid``; ``unverified`` if the records alone are
             passive, but the run was not simulated again.
         environment: ``strict`` (Σ E_k <= 0 held), ``within slack`` or ``active``; None if invalid.
-        certified: True if the recorded device bears the coupling and the run kept its time; None if
-            its damping is unknown or its motion is prescribed.
-        reason: The verdict in a sentence.
+        sentence: The verdict in a sentence.
+        remarks: Further clauses on an undamaged recording: silence, device, energy, end, checks.
         tick: First tick at fault, or None.
         port: Port at fault, ``environment`` or ``device``, or the field.
         joules: Energy at fault in J: created beyond the bound, or the mismatch.
         slack_share: Largest share of the slack that was used; 0 if strict.
-        resimulation: ``bit for bit``, ``within 1e-9 (other processor)``, ``disagrees`` or ``not
-            re-simulated: …``.
+        agreement: Outcome of the re-simulation; None if the audit did not get there.
+        obstacle: Reason why the run was not simulated again; empty if it was.
         is_cut: True if the file lacks the end of its run, or did before a repair; the verdict is on
             the rest.
+        lacks_end: True if the file lacks the end of its run, which a repair mends.
         cut: Reasons for that, as a sentence; else empty.
         ticks: Number of records.
         duration: Time of the run's clock at the last record in s, with missed deadlines. If the
@@ -81,11 +82,12 @@ class AuditReport:
         coupling: Requested, law and effective coupling at the start; None if invalid.
         coupling_sentences: Sentences on them, and on changes by commands. They hold away from
             contact, or everywhere if the tool was never released.
+        couplings: First of these sentences, of each hand.
         unchecked: Parts that only the re-simulation confirms; empty if there are none. Without a
             re-simulation it names the changes that would pass: those of ``wrench_on_device`` and
             ``share`` that fit each other.
-        timekeeping: Time that the run kept, and the device conditions at this time; None where the
-            records could not be read.
+        certification: Verdict on the device, of several hands on the worst; None if invalid.
+        trip: Stop by the guard; None without one.
         damping_margin: Smallest share of the device's damping that the coupling leaves at the time
             that the run kept, 1 − needed / b over the kinds of axis. It is negative if more is
             needed than available; None if b is unknown or the motion prescribed.
@@ -96,29 +98,33 @@ class AuditReport:
         findings: Faults of the scene of which the run warned, as sentences.
         accepts_unverified: True if ``unverified`` counts as a success in ``exit_code``.
         hands: Name of each hand's grip, if several hold the scene; else empty. The environment is
-            judged over all of them, and each device by itself; ``certified`` is False if one lacks
-            damping. Conditions and couplings name their hand, ``energies`` are sums over all hands.
+            judged over all of them, and each device by itself. Conditions and couplings name their
+            hand, ``energies`` are sums over all hands.
     """
 
     path: Path
     verdict: Verdict
     environment: Environment | None
-    certified: bool | None
-    reason: str
+    sentence: str
+    remarks: tuple[str, ...] = ()
     tick: int | None = None
     port: str = ""
     joules: float = 0.0
     slack_share: float = 0.0
-    resimulation: str = ""
+    agreement: Agreement | None = None
+    obstacle: str = ""
     is_cut: bool = False
+    lacks_end: bool = False
     cut: str = ""
     ticks: int = 0
     duration: float = 0.0
     conditions: tuple[str, ...] = ()
     coupling: RunCoupling | None = None
     coupling_sentences: tuple[str, ...] = ()
+    couplings: tuple[str, ...] = ()
     unchecked: str = ""
-    timekeeping: Timekeeping | None = None
+    certification: Certification | None = None
+    trip: Trip | None = None
     damping_margin: float | None = None
     energies: dict[str, float] = field(default_factory=dict)
     start_potential: float = 0.0
@@ -136,7 +142,10 @@ class AuditReport:
     def to_json(self) -> str:
         """Returns the report as one JSON object; a number that is not finite becomes null."""
         values = asdict(self) | {"path": str(self.path), "margin": self.margin}
-        values["max_net_energy"] = self.max_net_energy
+        for name in ("reason", "resimulation", "certified", "max_net_energy"):
+            values[name] = getattr(self, name)
+        found = values.pop("certification") and self.certification
+        values |= found.to_dict() if found else {}
         if not self.hands:
             del values["hands"]
         return json.dumps(finite_or_null(values), indent=2, allow_nan=False)
@@ -148,8 +157,33 @@ class AuditReport:
 
     @property
     def hand_energy(self) -> HandEnergy:
-        """Energy of the hand that decides (``hand_energy.worst_of``)."""
-        return worst_of(self.hand_energies or (HandEnergy(),))
+        """Energy of the hand that decides on the certificate."""
+        return HandEnergy() if self.certification is None else self.certification.energy
+
+    @property
+    def reason(self) -> str:
+        """The verdict in a sentence, with all remarks."""
+        return "; ".join((self.sentence, *self.remarks))
+
+    @property
+    def resimulation(self) -> str:
+        """Outcome of the re-simulation in words; empty if the audit did not get there."""
+        return f"{self.agreement or ''}{': ' if self.obstacle else ''}{self.obstacle}"
+
+    @property
+    def certified(self) -> bool | None:
+        """True if the device bears the coupling as the run was; None if that is unknown."""
+        return None if self.certification is None else self.certification.verdict
+
+    @property
+    def answer(self) -> str:
+        """Verdict on the device in a table: yes, no or not judged."""
+        return {True: "yes", False: "no", None: "not judged"}[self.certified]
+
+    @property
+    def timekeeping(self) -> Timekeeping | None:
+        """Time that the run kept; None if invalid."""
+        return None if self.certification is None else self.certification.kept
 
     @property
     def exit_code(self) -> int:
@@ -187,14 +221,20 @@ def verdict_words(verdict: str, environment: str, port: str) -> str:
 # End of a run
 
 
-def unusual_end(events: Sequence[Mapping[str, Any]]) -> str:
-    """Returns a clause that names the event that ended the run; empty for an ordinary end."""
+LONGEST_WORDS = 500
+"""Largest number of characters of a text that is read from a foreign file."""
+
+_USUAL_ENDS = ("duration", "signal", "caller", BY_TRIP, None, "")
+
+
+def unusual_end(trip: Trip | None, events: Sequence[Mapping[str, Any]]) -> str:
+    """Returns a clause that names what ended the run; empty for an ordinary end."""
     clauses = []
+    if trip is not None:
+        clauses.append(f"the guard tripped at tick {trip.tick}: {trip.words[:LONGEST_WORDS]}")
     for event in events:
-        name, reason = event.get("event"), event.get("reason")
-        if name == "trip":
-            clauses.append(f"the guard tripped at tick {event.get('tick')}: {_shorten(reason)}")
-        elif name == "bridge_died":
+        name, by = event.get("event"), event.get("error") or event.get("reason")
+        if name == "bridge_died":
             clauses.append(f"the bridge died after tick {event.get('tick')}")
         elif name == "recorder_died":
             clauses.append("the recorder died during the run")
@@ -202,22 +242,10 @@ def unusual_end(events: Sequence[Mapping[str, Any]]) -> str:
             clauses.append(f"the machine was asleep for {event.get('seconds', 0):.3g} s")
         elif name == "stop" and event.get("signal"):
             clauses.append(f"stopped by {event['signal']} at tick {event.get('tick')}")
-        elif name == "stop" and reason not in ("duration", "signal", "caller", None, ""):
-            clauses.append(f"stopped by {_shorten(reason)}")
-    has_trip = any(event.get("event") == "trip" for event in events)
-    if has_trip:  # its exception is reported as a stop too
-        clauses = [clause for clause in clauses if not clause.startswith("stopped by")]
+        elif name == "stop" and trip is None and by not in _USUAL_ENDS:
+            clauses.append(f"stopped by {str(by)[:LONGEST_WORDS]}")
     return "; ".join(clauses)
 
-
-def _shorten(reason: object) -> str:
-    """Returns a reason's text without its leading tick, at most 200 characters."""
-    text = str(reason)
-    head, mark, rest = text.partition(": ")
-    return rest[:200] if mark and head.startswith("tick ") else text[:200]
-
-
-Facts = dict[str, Any]
 
 # Energies over the whole recording
 
@@ -290,80 +318,84 @@ def _first(
 # Decision
 
 
-@dataclass(frozen=True, slots=True)
-class Decision:
-    """Verdict and its reason; the fields are those of ``AuditReport``."""
-
-    verdict: Verdict
-    environment: Environment | None
-    reason: str
-    tick: int | None = None
-    port: str = ""
-    joules: float = 0.0
-    slack_share: float = 0.0
-
-
 def decide_on_hands(
-    fault: Fault | None, energies: Sequence[PassivityTally], *, gap: str, strict: bool
-) -> Decision:
+    report: AuditReport,
+    fault: Fault | None,
+    energies: Sequence[PassivityTally],
+    *,
+    gap: str,
+    strict: bool,
+) -> AuditReport:
     """Decides over the tallies of all hands, as ``decide`` does; the worst verdict counts."""
     ranks = ("invalid", "active", "unverified", "passive")
-    found = [decide(fault, each, gap=gap, strict=strict) for each in energies]
-    found = found or [decide(fault, None, gap=gap, strict=strict)]
+    tallies = energies if fault is None else ()
+    found = [decide(report, fault, each, gap=gap, strict=strict) for each in tallies or (None,)]
     return min(found, key=lambda each: (ranks.index(each.verdict), each.tick or 0))
 
 
 def decide(
-    fault: Fault | None, energies: PassivityTally | None, *, gap: str, strict: bool
-) -> Decision:
+    report: AuditReport,
+    fault: Fault | None,
+    energies: PassivityTally | None,
+    *,
+    gap: str,
+    strict: bool,
+) -> AuditReport:
     """Decides between ``passive``, ``unverified``, ``active`` and ``invalid``.
 
     Args:
+        report: Report without a verdict.
         fault: Fault that makes the recording invalid, or None.
         energies: Energies of a recording without a fault.
         gap: Clause with the reason why the run was not simulated again; empty if it was.
         strict: True accepts only (14) itself, not the slack that the device condition leaves.
     """
-    found = _decide_on_records(fault, energies, strict=strict)
-    if found.verdict != "passive" or not gap:
-        return found
-    reason = f"{gap} {found.reason}"
-    return replace(found, verdict="unverified", reason=reason)
-
-
-def _decide_on_records(
-    fault: Fault | None, energies: PassivityTally | None, *, strict: bool
-) -> Decision:
     if fault is not None or energies is None:
         fault = fault or Fault("the recording is empty: the run had no tick")
-        return Decision("invalid", None, fault.reason, fault.tick, fault.port, fault.joules)
+        return replace(
+            report,
+            sentence=fault.reason,
+            tick=fault.tick,
+            port=fault.port,
+            joules=fault.joules,
+        )
     unstrict, active, excess = energies.unstrict, energies.active, energies.excess
+    state: Environment = "strict" if unstrict is None else "within slack"
+    report = replace(report, environment=state, slack_share=energies.slack_share)
     if excess is not None and not (active is not None and active[0] <= excess[0]):
         tick, joules = excess
-        reason = (
+        sentence = (
             f"until tick {tick} the hand got {format_energy(joules)} beyond what it put in, what "
             "the device's damping burned, and what scene and coupling released"
         )
-        other: Environment = "within slack" if unstrict else "strict"
-        return Decision("active", other, reason, tick, "device", joules, energies.slack_share)
+        return replace(
+            report, verdict="active", sentence=sentence, tick=tick, port="device", joules=joules
+        )
+    beyond = active or (unstrict if strict else None)
+    if beyond is not None:
+        tick, joules = beyond
+        limit = "its slack" if active else "zero, the strict limit,"
+        return replace(
+            report,
+            verdict="active",
+            environment="active" if active else state,
+            sentence=f"from tick {tick} the environment exceeds {limit} by {format_energy(joules)}",
+            tick=tick,
+            port="environment",
+            joules=joules,
+        )
     if unstrict is None:
         # rounding may leave it above zero
         lost = max(-energies.energies["environment_energy"], 0.0)
         spent = f"{format_energy(lost)} dissipated" if lost else "nothing was dissipated"
-        reason = f"the environment never gave out more than it got ({spent})"
-        return Decision("passive", "strict", reason)
-    share = energies.slack_share
-    if active is None and not strict:
-        reason = (
+        sentence = f"the environment never gave out more than it got ({spent})"
+    else:
+        sentence = (
             "energy was created at times, within the slack that the coupling leaves "
-            f"({share:.0%} of it used)"
+            f"({energies.slack_share:.0%} of it used)"
         )
-        return Decision("passive", "within slack", reason, slack_share=share)
-    tick, joules = active or unstrict
-    limit = "its slack" if active else "zero, the strict limit,"
-    reason = f"from tick {tick} the environment exceeds {limit} by {format_energy(joules)}"
-    state: Environment = "active" if active else "within slack"
-    return Decision("active", state, reason, tick, "environment", joules, share)
+    verdict: Verdict = "unverified" if gap else "passive"
+    return replace(report, verdict=verdict, sentence=f"{gap} {sentence}" if gap else sentence)
 
 
 # Audit of one file
@@ -385,89 +417,168 @@ def verdict_on(
     """
     recordings = open_hands(path)
     recording = recordings[0]
-    facts: dict[str, Any] = {
-        "path": recording.path,
-        "is_cut": bool(recording.cut_sentence),
-        "cut": recording.cut_sentence,
-        "ticks": recording.count,
-        "events": _event_counts(recording),
-        "findings": tuple(
-            str(event.get("sentence", ""))[:MAX_FINDING]
+    report = AuditReport(
+        path=recording.path,
+        verdict="invalid",
+        environment=None,
+        sentence="",
+        is_cut=bool(recording.cut_sentence),
+        lacks_end=recording.is_cut,
+        cut=recording.cut_sentence,
+        ticks=recording.count,
+        events=_event_counts(recording),
+        findings=tuple(
+            str(event.get("sentence", ""))[:LONGEST_WORDS]
             for event in recording.events
             if event.get("event") == "finding"
         ),
-        "certified": None,
-        "accepts_unverified": accepts_unverified,
-    }
+        accepts_unverified=accepts_unverified,
+    )
     energies: list[PassivityTally] = []
-    outcome = ReplayOutcome("")
+    fault: Fault | None = None
     try:
+        report = replace(report, trip=Trip.among(recording.events))
         hands = [AuditedHand(each, AuditedRun.of(each)) for each in recordings]
-        of_hands = [_device_facts(hand.run, hand.recording) for hand in hands]
-        for hand, own in zip(hands, of_hands, strict=True):
-            own["coupling_sentences"] += hand.run.events.changes_of_coupling(hand.run.method)
-        facts |= _joined(of_hands, recordings)
-        facts["duration"] = recording.count * hands[0].run.parameters.period
-        facts["unchecked"] = _unchecked(hands[0].run)
+        devices = [JudgedDevice.before_run(hand) for hand in hands]
+        report = replace(report, **_joined(devices))
+        report = replace(report, duration=recording.count * hands[0].run.parameters.period)
+        report = replace(report, unchecked=_unchecked(hands[0].run))
         fault = file_fault(recording) or first_contradiction(metadata_statements(recordings))
         fault = fault or _hands_fault(hands)
         if fault is None:
-            energies = [PassivityTally(is_watched=own["certified"] is not True) for own in of_hands]
+            energies = [PassivityTally(is_watched=not each.is_borne) for each in devices]
             with comparison(hands, is_trusted=in_process) as replayed:
-                fault = _fault_in_ticks(hands, energies, of_hands, facts)
-                facts |= _joined(of_hands, recordings)
+                report, fault = _compared_in_ticks(report, hands, devices, energies)
                 if fault is None:
                     outcome = replayed()
-                    facts["resimulation"] = outcome.agreement
+                    report = replace(report, agreement=outcome.agreement, obstacle=outcome.obstacle)
                     fault = _replay_fault(outcome)
     except RecordingError as error:
         fault = Fault(str(error))
-    gap = "" if outcome.has_run else f"the run was {outcome.agreement}; in its records alone"
-    if any(event.get("unsound") for event in recording.events):
+    gap = f"the run was {report.resimulation}; in its records alone" if report.obstacle else ""
+    if report.trip and report.trip.is_unsound:
         gap = "MuJoCo could not simulate the scene to the end; until then"
-    found = asdict(decide_on_hands(fault, energies, gap=gap, strict=strict))
-    if fault is None:
-        if not outcome.has_run:
-            facts["unchecked"] = facts["unchecked"] or _UNCHECKED_WITHOUT_REPLAY
-        notes = (found["reason"], *_notes(facts, recording.events))
-        found["reason"] = "; ".join(note for note in notes if note)
-    return AuditReport(**facts, **found)
+    report = decide_on_hands(report, fault, energies, gap=gap, strict=strict)
+    if report.verdict == "invalid":
+        return replace(report, certification=None)
+    if report.obstacle:
+        report = replace(report, unchecked=report.unchecked or _UNCHECKED_WITHOUT_REPLAY)
+    return replace(report, remarks=tuple(filter(None, _remarks(report, recording.events))))
 
 
-def _hand_words(facts: Mapping[str, Any]) -> str:
+def _hand_words(report: AuditReport) -> str:
     """Returns a clause for each hand that got more than ``INSTANT``; empty without one."""
-    grips = facts.get("hands") or ("",)
     return "; ".join(
         f"net to the hand{f' at {grip!r}' if grip else ''} {energy.sentence}"
-        for grip, energy in zip(grips, facts["hand_energies"], strict=True)
+        for grip, energy in zip(report.hands or ("",), report.hand_energies, strict=True)
         if energy.net > INSTANT
     )
 
 
-def _joined(of_hands: Sequence[dict[str, Any]], recordings: Sequence[RecordingFile]) -> Facts:
-    """Returns the facts on all hands' devices; of one hand, just its own.
+@dataclass(slots=True, kw_only=True)
+class JudgedDevice:
+    """Findings of an audit on the device of a hand.
 
-    Sentences name their hand. Of margin and kept time those of the worst device count.
+    Attributes:
+        grip: Name of the hand's grip.
+        is_borne: True if the device meets its conditions with every tick in time.
+        conditions: Its conditions, as sentences.
+        damping_margin: Smallest share of its damping that is left; None if unknown.
+        coupling: Requested, law and effective coupling.
+        coupling_sentences: Sentences on them, and on changes by commands.
+        certification: Verdict on the device after the run; None before its ticks were read.
     """
-    if len(of_hands) == 1:
-        return of_hands[0]
-    grips = tuple(each.meta.get("grip", "") for each in recordings)
-    found: Facts = {"hands": grips, "coupling": of_hands[0]["coupling"]}
-    for name in ("conditions", "coupling_sentences"):
-        found[name] = tuple(
-            f"{grip}: {sentence}"
-            for grip, own in zip(grips, of_hands, strict=True)
-            for sentence in own[name]
+
+    grip: str
+    is_borne: bool
+    conditions: tuple[str, ...]
+    damping_margin: float | None
+    coupling: RunCoupling
+    coupling_sentences: tuple[str, ...]
+    certification: Certification | None = None
+
+    @classmethod
+    def before_run(cls, hand: AuditedHand) -> JudgedDevice:
+        """Judges the device by the metadata and events.
+
+        Raises:
+            RecordingError: Their numbers are beyond the range of the theory.
+        """
+        run, recording = hand.run, hand.recording
+        info, method, parameters = run.info, run.method, run.parameters
+        try:
+            coupling = RunCoupling.of(
+                method,
+                parameters.timestep,
+                requested_of(recording.meta),
+                law=parameters.coupling,
+                measured=parameters.effective,
+                is_always_implicit=not parameters.scene_ticks
+                and was_never_lossless(recording.count, recording.flags),
+            ).felt_at(parameters.grip, parameters.scale, parameters.force_scale)
+            conditions = run_conditions(info, run.worst, method)
+            return cls(
+                grip=recording.meta.get("grip", ""),
+                is_borne=is_run_certified(conditions, method) is True,
+                conditions=condition_sentences(info, run.worst, method),
+                damping_margin=damping_margin(conditions),
+                coupling=coupling,
+                coupling_sentences=coupling.sentences(info)
+                + run.events.changes_of_coupling(method),
+            )
+        except HapticBridgeError as error:  # numbers outside the theory's range
+            raise RecordingError(f"the metadata are out of range: {error}") from None
+
+    def judge(self, hand: AuditedHand, timing: TimingTally, energy: HandEnergy) -> None:
+        """Judges the device by the run: the time that it kept, and what the hand got."""
+        run, recording = hand.run, hand.recording
+        times = RunTimes(
+            ticks=timing.ticks,
+            fresh=fresh_share(run.info, run.parameters.period, timing.fresh, timing.due),
+            new_samples=timing.fresh,
+            due=timing.due,
+            mean_delay=timing.delays / max(timing.ticks, 1),
+            mean_jitter=timing.jitter / max(timing.ticks, 1),
+            delay_energy=timing.max_uncovered,
+            is_realtime=any(event.get("event") == "real_time" for event in recording.events),
+            flags=recording.flags,
+            has_tripped=any(event.get("event") == "trip" for event in recording.events),
+            scene_steps=timing.scene_steps,
+            scene_silence=run.parameters.period * timing.longest_silence,
+            silence=timing.silence,
+            silent_tick=timing.silent_tick,
         )
-    certified = [own["certified"] for own in of_hands]
-    found["certified"] = worst_verdict(certified)
-    margins = [own["damping_margin"] for own in of_hands if own["damping_margin"] is not None]
-    found["damping_margin"] = min(margins, default=None)
-    worst = [own for own in of_hands if own["certified"] == found["certified"]]
-    kept = [own["timekeeping"] for own in worst if "timekeeping" in own]
-    if kept:
-        found["timekeeping"] = max(kept, key=lambda each: bool(each.slowness))
-    return found
+        found = certification_of(run.info, run.worst, run.method, times, energy)
+        self.certification = found
+        if found.kept.conditions:
+            self.damping_margin = damping_margin(found.kept.conditions)
+
+
+def _joined(devices: Sequence[JudgedDevice]) -> dict[str, Any]:
+    """Returns fields of ``AuditReport`` on all hands' devices.
+
+    Sentences of several name their hand. The smallest margin and the worst verdict count.
+    """
+    has_several, first = len(devices) > 1, devices[0]
+    margins = [each.damping_margin for each in devices if each.damping_margin is not None]
+    found = [each.certification for each in devices if each.certification is not None]
+
+    def named(grip: str, sentences: Sequence[str]) -> list[str]:
+        return [f"{grip}: {each}" if has_several else each for each in sentences]
+
+    return {
+        "hands": tuple(each.grip for each in devices) if has_several else (),
+        "coupling": first.coupling,
+        "conditions": tuple(s for each in devices for s in named(each.grip, each.conditions)),
+        "coupling_sentences": tuple(
+            s for each in devices for s in named(each.grip, each.coupling_sentences)
+        ),
+        "couplings": tuple(
+            s for each in devices for s in named(each.grip, each.coupling_sentences[:1])
+        ),
+        "damping_margin": min(margins, default=None),
+        "certification": worst_certification(found) if found else None,
+    }
 
 
 _OF_A_HAND = ("coupling_work", "device_energy")
@@ -501,42 +612,48 @@ def _hands_fault(hands: Sequence[AuditedHand]) -> Fault | None:
     return None
 
 
-def _fault_in_ticks(
+def _compared_in_ticks(
+    report: AuditReport,
     hands: Sequence[AuditedHand],
+    devices: Sequence[JudgedDevice],
     energies: Sequence[PassivityTally],
-    of_hands: Sequence[dict[str, Any]],
-    facts: dict[str, Any],
-) -> Fault | None:
+) -> tuple[AuditReport, Fault | None]:
     """Computes all ticks a second time, and compares what the file states with them.
 
-    ``energies`` collect each hand's balance; what is found joins the facts of each hand, and those
-    of the run. Returns the first fault.
+    ``energies`` collect each hand's balance. Returns the report with energies and verdicts on the
+    devices, and the first fault.
     """
     faults = [structure_fault(hand.recording.blocks(), hand.run.events) for hand in hands]
     fault = next(filter(None, faults), None)
     if fault is not None:
-        return fault
+        return report, fault
     timings = [TimingTally(hand.run.parameters) for hand in hands]
-    fault, facts["duration"] = _check_records(hands, energies, timings)
-    facts["energies"] = _energies_of_hands(energies)
-    facts["start_potential"] = meta_start(hands[0].recording.meta, "start_potential")[0]
-    facts["hand_energies"] = tuple(each.hand_energy for each in energies)
-    for hand, own, timing, tally in zip(hands, of_hands, timings, energies, strict=True):
-        own.update(_time_facts(hand, timing, own["certified"], tally.hand_energy))
+    fault, duration = _check_records(hands, energies, timings)
+    for hand, device, timing, tally in zip(hands, devices, timings, energies, strict=True):
+        device.judge(hand, timing, tally.hand_energy)
         fault = fault or first_contradiction(event_statements(hand.recording, timing))
-    return fault
+    report = replace(
+        report,
+        duration=duration,
+        energies=_energies_of_hands(energies),
+        start_potential=meta_start(hands[0].recording.meta, "start_potential")[0],
+        hand_energies=tuple(each.hand_energy for each in energies),
+        **_joined(devices),
+    )
+    return report, fault
 
 
-def _notes(facts: Mapping[str, Any], events: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+def _remarks(report: AuditReport, events: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
     """Returns what a reason adds on a recording without a fault, in clauses; some are empty."""
-    kept = facts.get("timekeeping")
-    energy = worst_of(facts["hand_energies"])
-    cause = kept.refutation(energy) if kept else ""
-    doubt = kept.fault if kept else ""
-    if facts["certified"] is False and cause in ("", energy.fault):
-        doubt = cause or (kept.lack if kept else "the device has less than the coupling needs")
-    silence = kept.silence if kept else ""
-    return silence, doubt, _hand_words(facts), unusual_end(events), facts["unchecked"]
+    found = report.certification
+    silence = found and found.kept.silence
+    return (
+        silence.sentence if silence else "",
+        found.reason if found else "",
+        _hand_words(report),
+        unusual_end(report.trip, events),
+        report.unchecked,
+    )
 
 
 def _check_records(
@@ -611,70 +728,12 @@ def _replay_fault(outcome: ReplayOutcome) -> Fault | None:
     )
 
 
-MAX_FINDING = 500
-"""Largest number of characters of a recorded warning, which is read from a foreign file."""
-
-
 def _event_counts(recording: RecordingFile) -> dict[str, int]:
     counts: dict[str, int] = {}
     for event in recording.events:
         name = str(event.get("event", "unnamed"))
         counts[name] = counts.get(name, 0) + 1
     return counts
-
-
-def _device_facts(run: AuditedRun, recording: RecordingFile) -> dict[str, Any]:
-    info, method, parameters = run.info, run.method, run.parameters
-    try:
-        worst = run.worst
-        coupling = RunCoupling.of(
-            method,
-            parameters.timestep,
-            requested_of(recording.meta),
-            law=parameters.coupling,
-            measured=parameters.effective,
-            is_always_implicit=not parameters.scene_ticks
-            and was_never_lossless(recording.count, recording.flags),
-        ).felt_at(parameters.grip, parameters.scale, parameters.force_scale)
-        conditions = run_conditions(info, worst, method)
-        return {
-            "certified": is_run_certified(conditions, method),
-            "conditions": condition_sentences(info, worst, method),
-            "damping_margin": damping_margin(conditions),
-            "coupling": coupling,
-            "coupling_sentences": coupling.sentences(info),
-        }
-    except HapticBridgeError as error:  # numbers outside the theory's range
-        raise RecordingError(f"the metadata are out of range: {error}") from None
-
-
-def _time_facts(
-    hand: AuditedHand, timing: TimingTally, certified: bool | None, energy: HandEnergy
-) -> dict[str, Any]:
-    """Returns the time that a run kept, and its device's verdict and margin at this time."""
-    run, recording = hand.run, hand.recording
-    times = RunTimes(
-        ticks=timing.ticks,
-        fresh=fresh_share(run.info, run.parameters.period, timing.fresh, timing.due),
-        new_samples=timing.fresh,
-        due=timing.due,
-        mean_delay=timing.delays / max(timing.ticks, 1),
-        mean_jitter=timing.jitter / max(timing.ticks, 1),
-        delay_energy=timing.max_uncovered,
-        is_realtime=any(event.get("event") == "real_time" for event in recording.events),
-        flags=recording.flags,
-        has_tripped=any(event.get("event") == "trip" for event in recording.events),
-        scene_steps=timing.scene_steps,
-        scene_silence=run.parameters.period * timing.longest_silence,
-        silence=timing.silence,
-        silent_tick=timing.silent_tick,
-    )
-    conditions = run_conditions(run.info, run.worst, run.method) if run.method.has_law else ()
-    kept = Timekeeping.from_times(times, run.worst, conditions)
-    facts: dict[str, Any] = {"timekeeping": kept, "certified": kept.certified(certified, energy)}
-    if kept.conditions:
-        facts["damping_margin"] = damping_margin(kept.conditions)
-    return facts
 
 
 def _unchecked(run: AuditedRun) -> str:

@@ -31,7 +31,7 @@ from hapticbridge.audit.motion import (
 from hapticbridge.audit.spring import limits_on_tool, shortened, springs
 from hapticbridge.audit.structure import TOLERANCE, Deviation, is_let_go, may_fade
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.record import UNITS, TickFlag, has_flag
+from hapticbridge.kernel.record import UNITS, TickFlag, has_flag
 
 Flags = NDArray[np.bool_]
 
@@ -49,6 +49,7 @@ class AuditedBlock:
         motion: Motion of handle and tool.
         is_first: True for the first tick after a start or a pause without force, (n,).
         interval: Time in s since the device's last new sample, at least T between readings, (n,).
+        sample_ticks: Ticks since the device's last new sample, at least 1, (n,).
         share_before: r_{k−1}, the share of the device's motion that the handle made, (n,).
         rise_ticks: Ticks in which r rises from 0 to 1, (n,).
         scene_ticks: Ticks between two results of a slower scene; 0 for another.
@@ -60,6 +61,7 @@ class AuditedBlock:
     motion: Motion
     is_first: Flags
     interval: Array
+    sample_ticks: NDArray[np.int64]
     share_before: Array
     rise_ticks: Array
     scene_ticks: int
@@ -80,7 +82,7 @@ class AuditedBlock:
         before[is_reset] = 0.0
         # a start rises slowly; after a reset, or once r has been 0, it rises within the fade
         is_short = is_reset | ((ticks["share"] == 0.0) & may_fade(ticks))
-        start, fade = _newest(is_first), _newest(is_short)
+        start, fade = newest(is_first), newest(is_short)
         rise = np.where(fade >= start, parameters.guarding.fade_ticks, parameters.ramp_ticks)
         rise = np.where((start < 0) & (fade < 0), state.rise_ticks, rise)
         return cls(
@@ -90,6 +92,7 @@ class AuditedBlock:
             motion=Motion.from_records(ticks, state, events, before),
             is_first=is_first,
             interval=_sample_intervals(ticks, state, parameters.period),
+            sample_ticks=_sample_ticks(ticks, state),
             share_before=before,
             rise_ticks=rise,
             scene_ticks=parameters.scene_ticks,
@@ -102,6 +105,7 @@ class AuditedBlock:
             self.state,
             row=row.copy(),
             since_sample=float(self.interval[-1] * has_flag(row, TickFlag.STALE_SAMPLE)[0]),
+            stale_ticks=int(self.sample_ticks[-1] * has_flag(row, TickFlag.STALE_SAMPLE)[0]),
             rise_ticks=float(self.rise_ticks[-1]),
             sums=sums,
         )
@@ -112,9 +116,16 @@ def first_share(parameters: RunParameters) -> float:
     return 0.0 if parameters.guarding.has_hand or parameters.ramp_ticks > 0 else 1.0
 
 
-def _newest(is_on: Flags) -> NDArray[np.int64]:
+def newest(is_on: Flags) -> NDArray[np.int64]:
     """Returns the newest row that is True up to each row; -1 before the first."""
     return np.maximum.accumulate(np.where(is_on, np.arange(len(is_on)), -1))
+
+
+def _sample_ticks(ticks: NDArray[np.void], state: AuditState) -> NDArray[np.int64]:
+    count = np.arange(len(ticks))
+    last = newest(~has_flag(ticks, TickFlag.STALE_SAMPLE))
+    before = np.concatenate([[-1], last[:-1]])  # row of the last new sample
+    return np.asarray(np.where(before < 0, count + 1 + state.stale_ticks, count - before))
 
 
 def _sample_intervals(ticks: NDArray[np.void], state: AuditState, period: float) -> Array:

@@ -13,18 +13,18 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.certificate import default_coupling
 from hapticbridge.check.observe import Observation, Setting, observe
 from hapticbridge.check.source_map import Place, Places
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import default_coupling
+from hapticbridge.demand.methods import RIGID, default_method
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice, read_motion
 from hapticbridge.device.base import checked_number
 from hapticbridge.device.trajectory import lissajous
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.kernel.mujoco_c import quiet
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.recording import read_recording
-from hapticbridge.rendering import RIGID, default_method
 from hapticbridge.scene import Scene, SceneSource, compile_scene
 
 # Faults, each with its place and remedy

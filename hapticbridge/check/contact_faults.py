@@ -77,8 +77,7 @@ def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             friction=setting.friction,
             only_active=True,
         ):
-            clause, _, change = concern.partition("; write ")
-            is_cone = "pyramidal" in clause
+            clause, change, is_cone = concern
             if is_cone and is_cone_reported:
                 continue  # one option changes it for all contacts
             is_cone_reported |= is_cone

@@ -18,13 +18,13 @@ from hapticbridge.check.version import SceneVariant
 from hapticbridge.clock import LOWEST_RATE
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
-from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.parameters import MAX_SCENE_TICKS
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, publish, simulate
 from hapticbridge.plotting import new_figure
-from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import TAIL, Ring
 from hapticbridge.recording.recorder import NOBODY_READS
 from hapticbridge.scene import Scene

@@ -66,11 +66,13 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
                 "run --as-is, which refuses the scene",
                 is_note=True,
             )
-    concerns = [*case.source.concerns, *check_model(case.model, case.scene.grip)]
-    for concern in concerns:
-        if "integrator" not in concern:
-            attribute = "wind" if concern.startswith("wind") else "surfacevel"
-            place = places.with_attribute(attribute) or places.option(attribute)
+    found = (
+        ("wind", case.source.concerns),
+        ("surfacevel", check_model(case.model, case.scene.grip)),
+    )
+    for attribute, concerns in found:
+        place = places.with_attribute(attribute) or places.option(attribute)
+        for concern in concerns:
             yield Fault("unmetered work", place, concern, f"remove {attribute}")
 
 

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from hapticbridge.arguments import Arguments
-from hapticbridge.certificate import UNKNOWN_DAMPING
 from hapticbridge.check.cost import CostMeter, processor_costs
 from hapticbridge.check.observe import Playback, Setting
 from hapticbridge.check.perception import FeltError, felt_error
@@ -25,6 +24,7 @@ from hapticbridge.check.simplify import (
     solver_simplifications,
 )
 from hapticbridge.check.version import SceneVariant, name_everything, witness
+from hapticbridge.demand.certificate import UNKNOWN_DAMPING
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.kernel.mujoco_c import quiet

@@ -12,19 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.loop_setting import required_damping
+from hapticbridge.demand.methods import RIGID, default_method, unguarded_parameters
 from hapticbridge.errors import SceneError
-from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK, WARNINGS, warning_words
+from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.mujoco_c import warning_of
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.rigid_contact import DEPENETRATION, SOFTNESS
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
-from hapticbridge.loop_setting import required_damping
-from hapticbridge.record import TICK_DTYPE
-from hapticbridge.rendering import RIGID, default_method, unguarded_parameters
+from hapticbridge.run.summary import Ledger
 from hapticbridge.scene import Scene
-from hapticbridge.summary import Ledger
 
 # Clearance of the tool between opposite walls
 

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from hapticbridge.check.observe import Setting, rehearsal_parameters
 from hapticbridge.coupling import Coupling
-from hapticbridge.jit import direct
+from hapticbridge.demand.methods import RIGID
 from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.kernel.parameters import MAX_SUBSTEPS
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
-from hapticbridge.record import SAMPLE_DTYPE
-from hapticbridge.rendering import RIGID
 from hapticbridge.scene import Scene, SceneSource, plain_model
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.units import format_si

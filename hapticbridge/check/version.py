@@ -20,9 +20,9 @@ from hapticbridge.check.observe import (
     rehearse,
 )
 from hapticbridge.device import Motion
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
-from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import Scene, SceneSource, compile_scene
 from hapticbridge.scene.contacts import meeting_pairs
 from hapticbridge.scene.physics import pose_in, rotation_vector

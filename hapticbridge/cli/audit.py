@@ -24,17 +24,16 @@ from hapticbridge.audit.batch import (
     write_audits,
 )
 from hapticbridge.cli.terminal import err, out, plain, print_error, print_written, progress, working
+from hapticbridge.demand.trip import Trip
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.film import Shot, still
-from hapticbridge.guard import trip_remedy
 from hapticbridge.plotting import check_ending
 from hapticbridge.recording import Recording, read_recording, repair
-from hapticbridge.recording.reader import CUT, open_hands, read_hands
+from hapticbridge.recording.reader import read_hands
+from hapticbridge.replay.film import Shot, still
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
 from hapticbridge.report.cause import excess_of, pump_behind_trip
-from hapticbridge.report.evidence import Evidence, is_motion_prescribed
+from hapticbridge.report.evidence import Evidence
 from hapticbridge.sweep import Interrupted, Table
-from hapticbridge.timekeeping import NO_DAMPING
 from hapticbridge.units import energy_rows, format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_ifs, write_what_if
 from hapticbridge.whatif.page import changes, rows, sentences
@@ -172,10 +171,10 @@ class Audit:
 
     what_if: tuple[str, ...] = option((), metavar="NAME=VALUE", is_repeated=True)
     """Simulate the recorded hand again with this changed; several of them add up to one change.
-    Several values of one NAME, as in stiffness=400,800, are compared side by side. NAME is
-    stiffness, damping, rotational_stiffness, rotational_damping, method, rate, substeps,
-    scene_rate, scale, force_scale, contact_stiffness, controller, or a parameter of the scene;
-    GRIP:stiffness and the like are of one of several hands. The change is simulated with the
+    Several values of one NAME, as in stiffness=400,800, are compared side by side. NAME is an
+    option of 'run', as stiffness, rate, method, substeps, scale, controller or force_limit, or a
+    parameter of the scene; an unknown name lists them. GRIP:stiffness and the like are of one of
+    several hands. The change is simulated with the
     recorded motion and, where the device is known, with a model hand that yields. --plot and
     --report show all runs of one change side by side (one file only)."""
 
@@ -217,8 +216,8 @@ class Audit:
     def _print_cause(self, report: AuditReport) -> None:
         """Prints the largest excess of an active run, or a trip, and what to change."""
         if report.verdict != "active":
-            if "trip" in report.events:
-                self._print_trip(report)
+            if report.trip is not None:
+                self._print_trip(report, report.trip)
             return
         evidence = Evidence.of(read_recording(report.path, 0))
         excess = evidence and excess_of(evidence, report, in_process=self.in_process)
@@ -231,7 +230,7 @@ class Audit:
             out.print(f"what to change: {plain(excess.cause.remedy)}")
         out.print("next: hapticbridge guide active-verdict")
 
-    def _print_trip(self, report: AuditReport) -> None:
+    def _print_trip(self, report: AuditReport, trip: Trip) -> None:
         """Prints what to change after a trip of a run that was passive until then."""
         recording = read_recording(report.path, 0)
         cause = pump_behind_trip(recording, report, in_process=self.in_process)
@@ -242,7 +241,7 @@ class Audit:
         else:
             created = report.energies.get("environment_energy", 0.0)
             inputs = report.energies.get("external_work", 0.0)
-            remedy = trip_remedy(report.reason, work, created, input_work=inputs)
+            remedy = trip.remedy(work, created, input_work=inputs)
         if remedy:
             out.print(f"what to change: {plain(remedy)}")
         page = "active-verdict" if cause is not None or report.hand_energy.limit else "faults"
@@ -339,47 +338,36 @@ class Audit:
             return None
 
 
-def _without_condition(report: AuditReport) -> str:
-    """Returns the reason why a device has no condition."""
-    if all(is_motion_prescribed(hand.meta) for hand in open_hands(report.path)):
-        return "the device feels no force, as its motion is prescribed: there is nothing to certify"
-    slowness = "" if report.timekeeping is None else report.timekeeping.slowness
-    return f"device not judged (b >= KT/2 + B_law): {NO_DAMPING}{slowness}"
-
-
 def _print_report(report: AuditReport) -> None:
     colour = _VERDICT_COLOURS[report.verdict]
     judged = "environment " if report.environment and not report.port else ""
-    tripped = ", [bold yellow]then the guard stopped the run[/]" if "trip" in report.events else ""
+    tripped = ", [bold yellow]then the guard stopped the run[/]" if report.trip else ""
     out.print(f"{plain(str(report.path))}: {judged}[bold {colour}]{report.words}[/]{tripped}")
     out.print(f"  {plain(report.reason)}")
-    if report.resimulation.startswith("not"):
+    if report.obstacle:
         out.print(f"  [yellow]{plain(report.resimulation)}[/]")
     elif report.resimulation:
         out.print(f"  simulated again: {report.resimulation}")
     for sentence in report.findings:
         out.print(f"  [yellow]the run warned:[/yellow] {plain(sentence)}")
-    kept = report.timekeeping
-    for sentence in report.coupling_sentences:
-        if ": K = " in f": {sentence}":  # of several hands, behind the hand's grip
-            out.print(f"  {plain(sentence)}")
-    in_time = ", with every tick in time" if kept is not None and kept.fault else ""
+    found = report.certification
+    for sentence in report.couplings:
+        out.print(f"  {plain(sentence)}")
+    in_time = ", with every tick in time" if found and found.is_by_time else ""
     for sentence in report.conditions:
         out.print(f"  {plain(sentence)}{in_time}")
-    if not report.conditions and report.verdict != "invalid":
-        out.print(f"  {_without_condition(report)}")
-    if kept is not None and report.conditions:
-        out.print(f"  {kept.device_words(report.certified, report.hand_energy)}")
+    if found is not None:
+        out.print(f"  {plain(found.words)}")
     if report.is_cut:
         mend = f"'hapticbridge repair {shlex.quote(str(report.path))} OUTPUT' makes it whole"
-        hint = f"; {mend}" if CUT in report.cut else ""
+        hint = f"; {mend}" if report.lacks_end else ""
         out.print(plain(f"  {report.cut}: the verdict is on what it holds{hint}"))
     unusual = {name: count for name, count in report.events.items() if name not in _USUAL_EVENTS}
     if unusual:
         listed = ", ".join(f"{name} ({count})" for name, count in unusual.items())
         out.print(f"  events: {plain(listed)}")
-    rate = f", {kept.remark}" if kept is not None and kept.remark else ""
-    unfinished = "; the tick that tripped is not among them" if "trip" in report.events else ""
+    rate = f", {found.kept.remark}" if found and found.kept.remark else ""
+    unfinished = "; the tick that tripped is not among them" if report.trip else ""
     out.print(f"  {report.ticks} ticks, {report.duration:.3f} s{rate}{unfinished}")
     if energies := [" ".join(row) for row in energy_rows(report.energies, report.start_potential)]:
         out.print(f"  {', '.join(energies)}")

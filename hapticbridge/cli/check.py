@@ -15,7 +15,6 @@ import numpy as np
 from rich.table import Table
 
 from hapticbridge.arguments import option, shared
-from hapticbridge.certificate import default_coupling
 from hapticbridge.check.case import (
     DEFAULT_PERIOD,
     LARGEST_WORKSPACE,
@@ -42,13 +41,14 @@ from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import default_coupling
+from hapticbridge.demand.methods import RIGID, Contact, RunCoupling, default_method
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SceneError
-from hapticbridge.hands import Grasp
 from hapticbridge.kernel.mujoco_c import quiet
-from hapticbridge.options import BridgeOptions, Workspace
 from hapticbridge.plotting import check_ending, write_picture
-from hapticbridge.rendering import RIGID, Contact, RunCoupling, default_method
+from hapticbridge.run.hands import Grasp
+from hapticbridge.run.options import BridgeOptions, Workspace
 from hapticbridge.scene import plain_model, read_scene, settings_from
 from hapticbridge.units import format_si
 

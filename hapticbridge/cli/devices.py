@@ -15,8 +15,8 @@ from hapticbridge.device.driver import RULES_COMMAND, Driver, FoundDevice
 from hapticbridge.device.registry import all_drivers, driver_named
 from hapticbridge.device.watchdog import HANG
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.options import BridgeOptions
 from hapticbridge.realtime.doctor import LONGEST, SHORTEST, Diagnosis, diagnose
+from hapticbridge.run.options import BridgeOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Devices:
         if self.udev_rules:
             out.out(udev_rules(), end="")
             return 0
-        plugged, unseen = plugged_devices(), blind_spots()
+        plugged, unseen = plugged_devices(), [*map(str, blind_spots())]
         if self.as_json:
             print_json(_facts(plugged, unseen))
             return 0
@@ -95,7 +95,8 @@ def _print_plugged(
     for sentence in () if device.problem else _standstill(driver):
         out.print(f"  {plain(sentence)}")
     if command := _next(device, plugged):
-        hands_off = ", and let go of it" if command.startswith(IDENTIFY) else ""
+        is_identified = device.problem is None and _is_felt(device)
+        hands_off = ", and let go of it" if is_identified else ""
         out.print(f"  next: {plain(command)}{hands_off}")
 
 
@@ -116,15 +117,18 @@ def _print_supported(driver: Driver, plugged: list[FoundDevice], width: int) -> 
 def _next(device: FoundDevice, plugged: list[FoundDevice]) -> str:
     """Returns the command to type for a device; empty if its problem has another remedy."""
     if device.problem is None:
-        driver = driver_named(device.driver)
-        is_felt = driver is None or not driver.force.startswith("none")
-        return f"{IDENTIFY if is_felt else RUN} {_specification(device, plugged)}"
-    if RULES_COMMAND in device.problem:
+        return f"{IDENTIFY if _is_felt(device) else RUN} {_specification(device, plugged)}"
+    if device.lacks_permission:
         return (
             f"{RULES_COMMAND} | sudo tee {RULES_FILE}, "
             "then sudo udevadm control --reload && sudo udevadm trigger"
         )
     return ""
+
+
+def _is_felt(device: FoundDevice) -> bool:
+    driver = driver_named(device.driver)
+    return driver is None or driver.is_felt
 
 
 def _specification(device: FoundDevice, plugged: list[FoundDevice]) -> str:

@@ -12,10 +12,13 @@ import numpy as np
 from rich.table import Table
 
 from hapticbridge.arguments import option, shared
-from hapticbridge.certificate import default_coupling
 from hapticbridge.cli.terminal import notify, out, plain, print_json, progress, write_figure
 from hapticbridge.cli.zwidth import next_command
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
+from hapticbridge.demand.certificate import default_coupling
+from hapticbridge.demand.loop_setting import Lag, delay_ticks, whole_ticks
+from hapticbridge.demand.methods import RunCoupling, default_method
+from hapticbridge.demand.plots import draw_z_width
 from hapticbridge.device import AXES, DeviceInfo, open_device
 from hapticbridge.device.base import checked_close
 from hapticbridge.device.profile import Profile, own_folder
@@ -31,13 +34,10 @@ from hapticbridge.identify.identify import (
     duration_at,
     measured_profile,
 )
-from hapticbridge.loop_setting import Lag, delay_ticks, whole_ticks
-from hapticbridge.options import BridgeOptions
 from hapticbridge.plotting import check_ending
-from hapticbridge.rendering import RunCoupling, default_method
+from hapticbridge.run.options import BridgeOptions
 from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.theory.z_width import ZWidth, z_width
-from hapticbridge.theory_plots import draw_z_width
 from hapticbridge.units import format_si
 
 REPLACED = {"mass", "damping", "friction", "rotational_inertia", "rotational_damping", "delay"}

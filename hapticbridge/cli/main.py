@@ -177,8 +177,8 @@ def _parsed(command: type[Any], name: str, words: list[str]) -> Any:
     from hapticbridge.arguments import check_fields  # noqa: PLC0415 - not for --version
     from hapticbridge.cli import flags  # noqa: PLC0415
 
-    if {"-h", "--help", "--help-all"} & set(words):
-        print(flags.help_page(command, name, is_whole="--help-all" in words), flush=True)
+    if asked := {"-h", "--help", "--help-all"} & set(words):
+        print(flags.help_page(command, name, is_whole="--help-all" in asked), flush=True)
         return None
     made = flags.built(command, flags.values_of(command, name, words))
     check_fields(made)

@@ -11,13 +11,13 @@ from typing import Literal
 
 from hapticbridge.arguments import option, shared
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress
-from hapticbridge.compare import Comparison, Difference, compare
-from hapticbridge.dataset import DATASETS, write_dataset
 from hapticbridge.errors import RecordingError
-from hapticbridge.export import EVERYTHING, export, time_of
 from hapticbridge.files import atomic_write
-from hapticbridge.film import USUAL_SHOT, Shot, draw
 from hapticbridge.recording import read_recording
+from hapticbridge.replay.film import USUAL_SHOT, Shot, draw
+from hapticbridge.tools.compare import Comparison, Difference, compare
+from hapticbridge.tools.dataset import DATASETS, write_dataset
+from hapticbridge.tools.export import EVERYTHING, export, time_of
 from hapticbridge.units import format_si
 from hapticbridge.view import Address
 from hapticbridge.view.window import check_view
@@ -141,9 +141,9 @@ class Export:
     )
     """The format. 'parquet' and 'lerobot' need the extra 'tables', 'hdf5' and 'robomimic' the extra
     'hdf5', 'rerun' the extra 'rerun'."""
-    start: float = option(-math.inf, flag="from", metavar="S")
+    start: float = option(-math.inf, flag="from", metavar="S", is_finite=False)
     """First time to write, in s of the run; by default its start."""
-    end: float = option(math.inf, flag="to", metavar="S")
+    end: float = option(math.inf, flag="to", metavar="S", is_finite=False)
     """Time in s of the run before which the last tick lies; by default its end."""
     out: Path | None = None
     """File to write; by default the recording's name with the format's ending. A folder that does

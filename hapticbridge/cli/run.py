@@ -16,12 +16,6 @@ import numpy as np
 from rich.markup import escape
 
 from hapticbridge.arguments import option, shared
-from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import (
-    conditions_of,
-    default_coupling,
-    run_conditions,
-)
 from hapticbridge.check.case import DEFAULT_SECONDS
 from hapticbridge.check.findings import worst_faults
 from hapticbridge.check.observe import Setting
@@ -29,15 +23,23 @@ from hapticbridge.check.own_motion import NO_HAND, own_substeps
 from hapticbridge.cli.terminal import compiling, err, notify, out, plain, print_json
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import (
+    conditions_of,
+    default_coupling,
+    run_conditions,
+)
+from hapticbridge.demand.guard import refuse_simulated_time
+from hapticbridge.demand.loop_setting import device_period
+from hapticbridge.demand.methods import RunCoupling, default_method
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.base import checked_close
 from hapticbridge.device.mouse import MouseDevice
 from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, choices
-from hapticbridge.guard import refuse_simulated_time
-from hapticbridge.hands import Grasp, GripAxis, check_grasps
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.loop_setting import device_period
-from hapticbridge.options import (
+from hapticbridge.realtime import busy_step_time, scene_ticks_for
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.hands import Grasp, GripAxis, check_grasps
+from hapticbridge.run.options import (
     AUTO,
     DEFAULT_OPTIONS,
     BridgeOptions,
@@ -45,10 +47,8 @@ from hapticbridge.options import (
     steady_rotational_stiffness,
     steady_stiffness,
 )
-from hapticbridge.programs import prepare_run, words
-from hapticbridge.realtime import busy_step_time, scene_ticks_for
-from hapticbridge.rehearsal import static_load
-from hapticbridge.rendering import RunCoupling, default_method
+from hapticbridge.run.programs import prepare_run, words
+from hapticbridge.run.summary import WELD, Summary, coarse_spring, is_always_implicit
 from hapticbridge.scene import (
     Scene,
     SceneSource,
@@ -58,8 +58,8 @@ from hapticbridge.scene import (
     settings_from,
 )
 from hapticbridge.scene.compile import custom_text
+from hapticbridge.scene.rehearsal import static_load
 from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
-from hapticbridge.summary import WELD, Summary, coarse_spring, is_always_implicit
 from hapticbridge.units import format_si
 
 if TYPE_CHECKING:

@@ -10,27 +10,35 @@ from pathlib import Path
 from rich.table import Table
 
 from hapticbridge.arguments import Arguments, option, shared
-from hapticbridge.certificate import (
-    DampingCondition,
-    conditions_of,
-)
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress, write_figure
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import AXES, Device, DeviceInfo, open_device
-from hapticbridge.device.base import checked_close
-from hapticbridge.errors import HapticBridgeError, choices
-from hapticbridge.identify.z_width import SHARES, MeasuredWidth, measure_width, measured_points
-from hapticbridge.loop_setting import (
+from hapticbridge.demand.certificate import (
+    DampingCondition,
+    conditions_of,
+)
+from hapticbridge.demand.loop_setting import (
     IN_TIME,
     Lag,
     LoopSetting,
     delay_ticks,
     whole_ticks,
 )
-from hapticbridge.options import DEFAULT_OPTIONS, BridgeOptions
+from hapticbridge.demand.methods import RunCoupling, default_method
+from hapticbridge.demand.plots import (
+    Alternative,
+    alternatives,
+    draw_alternatives,
+    draw_z_width,
+    recommended,
+    recommended_coupling,
+)
+from hapticbridge.device import AXES, Device, DeviceInfo, open_device
+from hapticbridge.device.base import checked_close
+from hapticbridge.errors import HapticBridgeError, choices
+from hapticbridge.identify.z_width import SHARES, MeasuredWidth, measure_width, measured_points
 from hapticbridge.plotting import check_ending
-from hapticbridge.rendering import RunCoupling, default_method
+from hapticbridge.run.options import DEFAULT_OPTIONS, BridgeOptions
 from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.theory.bounds import (
     NEEDED_SHARE,
@@ -40,14 +48,6 @@ from hapticbridge.theory.bounds import (
 )
 from hapticbridge.theory.transfer import MAX_DELAY
 from hapticbridge.theory.z_width import ZWidth, z_width
-from hapticbridge.theory_plots import (
-    Alternative,
-    alternatives,
-    draw_alternatives,
-    draw_z_width,
-    recommended,
-    recommended_coupling,
-)
 from hapticbridge.units import format_si
 
 _ARGUMENTS = Arguments(HapticBridgeError)
@@ -224,15 +224,15 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
         reason = line.reason if line.is_required else f"not kept: {line.reason}"
         table.add_row(line.name, stiffness, f"{line.largest_damping:.4g} N s/m", reason)
     out.print(table)
-    reason = next(line.reason for line in z.lines if line.name == z.corner_limited_by)
+    reasons = {line.name: line.reason for line in z.lines}
+    reason = reasons.get(z.corner_limited_by, f"in every scene, {NEEDED_SHARE:.0%} of b needed")
     out.print(f"limited by: {z.corner_limited_by} ({reason})")
     for note in z.notes:
         out.print(f"note: {note}")
     (sentence,) = recommended_coupling(z).sentences()
     at, safe = z.corner.damping, z.corner.stiffness / STIFFNESS_MARGIN
-    where = "at a wall with" if z.delay else "at"
-    of = f"{safe:.4g} N/m that are safe {where} B_law = {at:.3g} N s/m"
-    out.print(f"use {sentence}: 80 % of the {of}")
+    of = f": 80 % of the {safe:.4g} N/m that are safe at B_law = {at:.3g} N s/m"
+    out.print(f"use {sentence}{'' if z.delay else of}")
     if command is None:
         out.print(
             "'hapticbridge run' has no low-pass: leave --filter-time out for a run's coupling"

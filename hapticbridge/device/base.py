@@ -23,8 +23,8 @@ from hapticbridge.arguments import (
 )
 from hapticbridge.dataclass_json import from_json, to_json
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.pose import Quaternion, canonical
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.pose import Quaternion, canonical
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 
 
 @contextmanager

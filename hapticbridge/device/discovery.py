@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
+from typing import NamedTuple
 
 from hapticbridge.device.driver import Driver, FoundDevice, UsbId
 from hapticbridge.device.registry import all_drivers, broken_drivers
@@ -32,20 +33,29 @@ def plugged_of(driver: Driver) -> list[FoundDevice]:
     return usb_search.find(driver)
 
 
-def blind_spots() -> list[str]:
-    """Returns the reasons why devices cannot be detected at all, one sentence each."""
+class BlindSpot(NamedTuple):
+    """Reason why devices cannot be detected at all, and the command that helps."""
+
+    sentence: str
+    command: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.sentence}: '{self.command}'" if self.command else self.sentence
+
+
+def blind_spots() -> list[BlindSpot]:
+    """Returns the reasons why devices cannot be detected at all."""
     spots = []
     if hid_search.hid_api() is None:
-        spots.append("hidapi cannot be loaded, so HID devices are not seen: 'pip install hidapi'")
+        loss = "hidapi cannot be loaded, so HID devices are not seen"
+        spots.append(BlindSpot(loss, "pip install hidapi"))
     if usb_search.libusb() is None:
-        spots.append(
-            "libusb cannot be loaded, so USB devices cannot be opened: 'pip install libusb-package'"
-        )
+        loss = "libusb cannot be loaded, so USB devices cannot be opened"
+        spots.append(BlindSpot(loss, "pip install libusb-package"))
     if find_spec("serial") is None:
-        spots.append(
-            "pyserial cannot be loaded, so serial ports are not seen: 'pip install pyserial'"
-        )
-    return spots + broken_drivers()
+        loss = "pyserial cannot be loaded, so serial ports are not seen"
+        spots.append(BlindSpot(loss, "pip install pyserial"))
+    return [*spots, *map(BlindSpot, broken_drivers())]
 
 
 _USB_DEVICE = 'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device"'

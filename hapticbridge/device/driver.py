@@ -112,6 +112,11 @@ class Driver:
                 return usb_id.model
         return None
 
+    @property
+    def is_felt(self) -> bool:
+        """True if a device of this driver gives a force."""
+        return bool(self.on_stall)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FoundDevice:
@@ -136,6 +141,11 @@ class FoundDevice:
     vendor: int = 0
     product: int = 0
     problem: str | None = None
+
+    @property
+    def lacks_permission(self) -> bool:
+        """True if this user may not open it."""
+        return self.problem == permission_problem(self.path)
 
     def __post_init__(self) -> None:
         for field in ("name", "serial"):

@@ -58,7 +58,7 @@ from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.device.transport.maker_library import LibraryFiles, MakerLibrary
 from hapticbridge.device.watchdog import SHORTEST_WATCHDOG, SILENCE, SilenceDetector, watchdog_time
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 # Device types of Force Dimension's library
 

@@ -64,8 +64,8 @@ from hapticbridge.device.transport.websocket import (
 from hapticbridge.device.watchdog import SILENCE, SilenceDetector
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.files import install_command
-from hapticbridge.pose import Quaternion, canonical
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.pose import Quaternion, canonical
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 # Messages of the Inverse Service
 

@@ -20,7 +20,7 @@ from hapticbridge.device.base import (
 )
 from hapticbridge.device.driver import Driver, Notify
 from hapticbridge.errors import DeviceError
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
     canonical,
@@ -29,7 +29,7 @@ from hapticbridge.pose import (
     rotation_between,
     scaled,
 )
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 
 Pose = tuple[float, float, float, float, float, float, float]
 """Position x, y, z in m and orientation as a unit quaternion qw, qx, qy, qz, in the device's

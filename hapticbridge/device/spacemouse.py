@@ -23,8 +23,8 @@ from hapticbridge.device.base import (
 from hapticbridge.device.driver import Driver, Notify, UsbId
 from hapticbridge.device.transport.hid import HidApi, HidLink, opened
 from hapticbridge.errors import DeviceError
-from hapticbridge.pose import Quaternion, canonical, product, quaternion_exp
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.pose import Quaternion, canonical, product, quaternion_exp
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 
 # Products of the SpaceMouse family
 

@@ -18,8 +18,8 @@ from hapticbridge.device.base import (
     checked_period,
 )
 from hapticbridge.errors import DeviceError
-from hapticbridge.jit import compiled, direct
-from hapticbridge.pose import (
+from hapticbridge.kernel.jit import compiled, direct
+from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
     canonical,
@@ -31,7 +31,7 @@ from hapticbridge.pose import (
     store_quaternion,
     store_vector,
 )
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 
 UNFELT_FORCE_LIMIT, UNFELT_TORQUE_LIMIT = 100.0, 10.0
 """Default limits in N and N m of a prescribed motion, which drives no motor. The coupling's force

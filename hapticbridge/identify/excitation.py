@@ -8,8 +8,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled
-from hapticbridge.pose import conjugate, product, quaternion_log
+from hapticbridge.kernel.jit import compiled
+from hapticbridge.kernel.pose import conjugate, product, quaternion_log
 
 Record: TypeAlias = Any
 """Structured scalar inside compiled code, where fields are attributes. NumPy's type has none."""

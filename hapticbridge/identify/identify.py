@@ -44,11 +44,11 @@ from hapticbridge.identify.fit import (
     noise_of,
     windows,
 )
-from hapticbridge.jit import direct
+from hapticbridge.kernel.jit import direct
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.plotting import new_figure
 from hapticbridge.realtime import real_time
 from hapticbridge.realtime.realtime import warn_of_refusals
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.units import format_si
 
 if TYPE_CHECKING:

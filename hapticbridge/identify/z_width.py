@@ -23,7 +23,7 @@ from hapticbridge.device import AXES, Device
 from hapticbridge.device.base import checked
 from hapticbridge.errors import DeviceError, IdentificationError
 from hapticbridge.identify.excitation import CALMING, CENTRING
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.theory.z_width import WITHOUT_HAND, ZWidth
 
 # Decay of a device's swing on a virtual wall

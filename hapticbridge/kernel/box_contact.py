@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled, stack_floats
+from hapticbridge.kernel.jit import compiled, stack_floats
 from hapticbridge.kernel.mujoco_c import floats
 from hapticbridge.kernel.rigid_contact import MARGIN
 

@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias
 
 import mujoco
 
-from hapticbridge.record import TickFlag
+from hapticbridge.kernel.record import TickFlag
 
 State: TypeAlias = Any
 """The kernel's whole state (``state.STATE_DTYPE``) as one record. Compiled functions get it by

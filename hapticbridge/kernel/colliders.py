@@ -40,7 +40,6 @@ import mujoco
 import numpy as np
 
 from hapticbridge.errors import SceneError
-from hapticbridge.jit import callback, compiled, external
 from hapticbridge.kernel.box_contact import (
     MAX_POINTS,
     POINT,
@@ -50,6 +49,7 @@ from hapticbridge.kernel.box_contact import (
     turned,
     turned_back,
 )
+from hapticbridge.kernel.jit import callback, compiled, external
 from hapticbridge.kernel.mujoco_c import floats, ints, library_path, pointer_at, singles, struct_of
 
 EXACT_POINTS = 1 << 30

@@ -23,14 +23,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import EQUALITY, Scheme, State
 from hapticbridge.kernel.force_level import limited_wrench_after_step
 from hapticbridge.kernel.handle import note_tool, tool_after_step, tool_motion
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import command_handle_velocity
 from hapticbridge.kernel.ledger import set_contact_springs_energy
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
     add,

@@ -36,8 +36,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import State
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.ledger import (
     allowed_energy,
     created_energy,
@@ -54,7 +54,7 @@ from hapticbridge.kernel.mujoco_c import (
     mj_rne,
     mj_solve_m,
 )
-from hapticbridge.pose import dot, vector_of
+from hapticbridge.kernel.pose import dot, vector_of
 
 LARGEST_SHARE = 0.99
 """Largest share of a tree's kinetic energy that one tick takes, without unit. The rest waits for

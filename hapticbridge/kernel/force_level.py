@@ -27,13 +27,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import FORCE_LIMITED, Part, State
 from hapticbridge.kernel.handle import (
     handle_of_step,
     note_tool,
     tool_motion,
 )
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import (
     applied_wrench,
     is_bent,
@@ -45,8 +45,8 @@ from hapticbridge.kernel.law import (
 )
 from hapticbridge.kernel.ledger import has_loaded_body, meter_ports_again
 from hapticbridge.kernel.mujoco_c import floats, mj_kinematics, mj_step2
+from hapticbridge.kernel.pose import Quaternion, Vector, norm
 from hapticbridge.kernel.rigid_contact import aim_again
-from hapticbridge.pose import Quaternion, Vector, norm
 
 TOLERANCE = 1e-6
 """Largest error of the wrench within a saturated step, as a share of the level; no unit. The error

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled, direct
 from hapticbridge.kernel.codes import Part, State
+from hapticbridge.kernel.jit import compiled, direct
 from hapticbridge.kernel.mujoco_c import (
     floats,
     ints,
@@ -19,7 +19,7 @@ from hapticbridge.kernel.mujoco_c import (
     mju_sub_quat,
 )
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
     add,

@@ -29,17 +29,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import Part, Scheme, State
 from hapticbridge.kernel.handle import (
     device_from_scene,
     scene_from_device,
     slip_handle,
 )
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.ledger import SLACK_SHARE, moment_dot
 from hapticbridge.kernel.mujoco_c import floats
 from hapticbridge.kernel.parameters import ALL_MOTORS, RunParameters
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
     add,
@@ -81,6 +81,7 @@ COUPLING_DTYPE = np.dtype(
         ("lacks_motors", "<i8"),
         ("lacks_motor", "<f8", 6),  # 1 for an axis of the device without motor
         ("owed", "<f8", 2),  # energy in J that late samples have put into the springs
+        ("tool_then", "<f8", 7),  # tool's pose after the tick of the device's last new sample
         ("hold", "<f8", 2),
         ("idle", "<f8", 2),
         ("twist_damping", "<f8"),
@@ -471,17 +472,17 @@ def _held(s: State, v: Vector, first: int, length: float) -> Vector:
 
 
 @compiled
-def lateness(s: State, kind: int, interval: float) -> tuple[float, float, float, float]:
+def lateness(s: State, kind: int, interval: float, ticks: int) -> tuple[float, float, float, float]:
     """Returns the terms of a sample's lateness for translation (0) or rotation (1).
 
     Args:
         s: The bound state, with the handle's new step d.
         kind: 0 or 1.
         interval: Time t since the last new sample in s.
+        ticks: m, ticks in this time.
 
     Returns:
-        K, K/2 + B'/T, K/2 + B'/T + c − b/t and ‖d‖². b is the device's damping seen at the handle,
-        at least what the condition needs; c is what a torque across the motion costs.
+        K, K/2 + B'/T, the energy D of ``charge_lateness`` and ‖d‖².
     """
     k, run, pose = s.coupling, s.run, s.pose
     stiffness, damping, across = k.stiffness, k.damping, 0.0
@@ -494,24 +495,50 @@ def lateness(s: State, kind: int, interval: float) -> tuple[float, float, float,
             across = twist_price(s, norm(vector_of(s.lossless.twist)))
     b = max(b, 0.5 * stiffness * run.period + damping)
     needed = 0.5 * stiffness + damping / run.period
-    return stiffness, needed, needed + across - b / interval, dot(d, d)
+    late = (needed + across - b / interval) * dot(d, d)
+    if ticks > 1:
+        then, pulled_on = (
+            k.tool_then,
+            subtract(vector_of(k.tool_then), vector_of(pose.tool_position)),
+        )
+        if kind == 1:
+            turn = (then[3], then[4], then[5], then[6])
+            pulled_on = rotation_between(quaternion_of(pose.tool_quaternion), turn)
+        paid = needed * dot(pulled_on, pulled_on) / (ticks - 1)
+        late += max(stiffness * dot(pulled_on, d) - paid, 0.0)
+    return stiffness, needed, late, dot(d, d)
 
 
 @compiled
-def charge_lateness(s: State, interval: float) -> None:
+def note_tool(s: State) -> None:
+    """Notes the tool's pose after the tick of a new sample."""
+    then, pose = s.coupling.tool_then, s.pose
+    for i in range(3):
+        then[i] = pose.tool_position[i]
+    for i in range(4):
+        then[3 + i] = pose.tool_quaternion[i]
+
+
+@compiled
+def charge_lateness(s: State, interval: float, ticks: int) -> None:
     """Charges the springs with the energy that a late sample may have put in.
 
-        D = (K/2 + B'/T + c − b/t) ‖d‖²,    b >= K T/2 + B' + c T
+        D = (K/2 + B'/T + c − b/t) ‖d‖² + max(K σ·d − (K/2 + B'/T) ‖σ‖²/(m − 1), 0)
 
-    d is the handle's step in m, t the time in s since the last sample, T the period. The hand has
-    felt a held force while the spring was stretched by d; the device burned b ‖d‖²/t. D is below
-    zero for a sample in time; a late one pays later, because the handle slips until the springs
-    hold less by D. b in N s/m is the device's damping seen at the handle, at least what the
-    condition needs.
+    with b >= K T/2 + B' + c T. c is what a torque across the motion costs. In the m ticks since the
+    last sample the tool has stretched the spring by σ, and the hand may have felt the force of the
+    first alone. The second part is at most (m − 1) K²/(2 (K + 2B'/T)) ‖d‖², what
+    ``theory.bounds.late_minimum_damping`` takes for any scene. d is the handle's
+    step in m, t the time in s since the last sample, T the period. The hand has felt a held force
+    while the spring was stretched by d; the device burned b ‖d‖²/t. D is below zero for a sample in
+    time; a late one pays later, because the handle slips until the springs hold less by D. b in
+    N s/m is the device's damping seen at the handle, at least what the condition needs.
     """
+    if ticks == 1:
+        note_tool(s)
     for kind in range(2):
-        _, _, lacking, square = lateness(s, kind, interval)
-        s.coupling.owed[kind] = max(s.coupling.owed[kind] + lacking * square, 0.0)
+        _, _, late, _ = lateness(s, kind, interval, ticks)
+        s.coupling.owed[kind] = max(s.coupling.owed[kind] + late, 0.0)
 
 
 @compiled

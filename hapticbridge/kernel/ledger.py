@@ -33,7 +33,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import (
     CONTACT_PYRAMIDAL,
     EQUALITY,
@@ -43,6 +42,7 @@ from hapticbridge.kernel.codes import (
     Scheme,
     State,
 )
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.mujoco_c import (
     floats,
     ints,
@@ -55,7 +55,7 @@ from hapticbridge.kernel.mujoco_c import (
     mj_make_m,
     pointer_at,
 )
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     Vector,
     add,
     cross,

@@ -41,7 +41,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import (
     COUPLING_ACTUATORS,
     LIMIT_JOINT,
@@ -53,6 +52,7 @@ from hapticbridge.kernel.codes import (
 from hapticbridge.kernel.explicit_bias import take_back, write_bias
 from hapticbridge.kernel.force_level import limited_wrench, limited_wrench_after_step
 from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains, torque_across
 from hapticbridge.kernel.ledger import (
     add_body_wrenches,
@@ -71,18 +71,7 @@ from hapticbridge.kernel.mujoco_c import (
     pointer_at,
     wide_ints,
 )
-from hapticbridge.kernel.springs import (
-    add_rest,
-    begin_springs,
-    bind_springs,
-    carry_springs,
-    evaluate_passive,
-    note_rest,
-    note_solved,
-    restore_springs,
-    share_springs,
-)
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
     add,
@@ -97,6 +86,17 @@ from hapticbridge.pose import (
     store_vector,
     subtract,
     vector_of,
+)
+from hapticbridge.kernel.springs import (
+    add_rest,
+    begin_springs,
+    bind_springs,
+    carry_springs,
+    evaluate_passive,
+    note_rest,
+    note_solved,
+    restore_springs,
+    share_springs,
 )
 
 _OWN_VECTORS = (

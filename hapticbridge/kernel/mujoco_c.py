@@ -23,13 +23,13 @@ from mujoco.introspect import ast_nodes, structs
 from numpy.typing import NDArray
 
 from hapticbridge.errors import SceneError
-from hapticbridge.jit import Deferred, compiled, direct, external, intrinsic
 from hapticbridge.kernel.codes import (
     BAD_RESULT,
     CONSTRAINTS_FULL,
     CONTACTS_FULL,
     OK,
 )
+from hapticbridge.kernel.jit import Deferred, compiled, direct, external, intrinsic
 
 
 def library_path() -> Path:

@@ -14,7 +14,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.dataclass_json import from_json, to_json
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.codes import Grip, Scheme, SchemeProperties
-from hapticbridge.pose import IDENTITY_POSE
+from hapticbridge.kernel.pose import IDENTITY_POSE
 
 OFF, DAMPER, ENVIRONMENT = 0, 1, 3
 """Passivity controllers, numbered as in recordings: none; damping against the motion with a tank
@@ -215,7 +215,7 @@ class RunParameters:
         grip: Name of the site on the tool.
         period: T in s.
         substeps: MuJoCo steps per tick, >= 1.
-        coupling: K and B' of the law (``rendering.Method.law_coupling``), not the effective
+        coupling: K and B' of the law (``methods.Method.law_coupling``), not the effective
             coupling.
         scale: Handle motion per device motion, without unit.
         force_scale: Force on the device per force on the tool, without unit. Power is equal on both

@@ -10,11 +10,12 @@ import math
 
 import numpy as np
 
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, Part, State
+from hapticbridge.kernel.hand_energy import INSTANT
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import held_energy, pulled
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, GuardParameters
-from hapticbridge.pose import Vector, norm, scaled
+from hapticbridge.kernel.pose import Vector, norm, scaled
 
 THRESHOLD = 1e-5
 """Energy debt in J above which the controller acts. Rounding and the first-order error of turning
@@ -58,6 +59,7 @@ OBSERVER_DTYPE = np.dtype(
         ("hand_energy", "<f8"),
         ("springs", "<f8"),
         ("max_unpaid_energy", "<f8"),
+        ("first_unpaid", "<i8"),
         ("created_energy", "<f8"),
         ("previous_created", "<f8"),
         ("previous_net_storage", "<f8"),
@@ -72,7 +74,8 @@ OBSERVER_DTYPE = np.dtype(
 N s/m and N m s/rad, energies in J, velocities in m/s and rad/s. ``max_guarded_energy`` is the
 largest ``guarded_energy`` so far. ``hand_energy`` is Σ (w·δp − b ‖δp‖²/t − W_u), ``springs`` the
 energy of the coupling's springs at the start and after each reset, ``max_unpaid_energy`` the
-largest unpaid energy (``hand_energy.HandEnergy``). ``reversals`` holds one bit per tick."""
+largest unpaid energy (``hand_energy.HandEnergy``), ``first_unpaid`` the first tick in which it was
+more than ``hand_energy.INSTANT``, −1 for none. ``reversals`` holds one bit per tick."""
 
 
 def bind_observer(observer: Part, guarding: GuardParameters) -> None:
@@ -83,6 +86,7 @@ def bind_observer(observer: Part, guarding: GuardParameters) -> None:
     observer["max_damping"] = guarding.max_damping
     observer["max_rotational_damping"] = guarding.max_rotational_damping
     observer["energy_credit_limit"] = guarding.energy_credit_limit
+    observer["first_unpaid"] = -1
 
 
 @compiled
@@ -250,6 +254,8 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     released = observer.springs - energy.environment_energy - energy.coupling_work
     paid = (s.run.force_scale / s.run.scale) * max(released, 0.0)
     observer.max_unpaid_energy = max(observer.max_unpaid_energy, observer.hand_energy - paid)
+    if observer.first_unpaid < 0 and observer.max_unpaid_energy > INSTANT:
+        observer.first_unpaid = s.loop.tick
     observer.guarded_energy = guarded_energy(s)
     observer.max_guarded_energy = max(observer.max_guarded_energy, observer.guarded_energy)
     for i in range(6):

@@ -55,12 +55,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import EQUALITY, LIMIT_JOINT, LIMIT_TENDON, Part, State
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.ledger import mocap_work, opened_by_mocap
 from hapticbridge.kernel.mujoco_c import floats, ints, mj_mul_jac, pointer_at, struct_of
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.pose import Vector, add, cross, norm, subtract, vector_of
+from hapticbridge.kernel.pose import Vector, add, cross, norm, subtract, vector_of
 
 SOFTNESS = 1e-3
 """Regularisation R over the inverse inertia of a contact, without unit. A steady force F on a mass

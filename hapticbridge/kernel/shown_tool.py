@@ -43,10 +43,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import Part, State
 from hapticbridge.kernel.force_level import limited_wrench
 from hapticbridge.kernel.handle import grip_pose, note_tool
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import (
     energy_at_level,
     held_energy,
@@ -61,7 +61,7 @@ from hapticbridge.kernel.law import (
 from hapticbridge.kernel.ledger import take_scene_energies
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
     add,

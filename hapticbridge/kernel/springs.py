@@ -24,8 +24,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import Part, State
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.mujoco_c import (
     field_address,
     floats,

@@ -34,7 +34,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import (
     HANDLE,
     WELD_NAME,
@@ -59,6 +58,7 @@ from hapticbridge.kernel.handle import (
     move_handle_home,
     set_tool,
 )
+from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.law import (
     COUPLING_DTYPE,
     Gains,
@@ -81,6 +81,7 @@ from hapticbridge.kernel.passivity_controller import (
     credit_springs,
     observe_reset,
 )
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.rigid_contact import RIGID_DTYPE, bind_contact, restore_model
 from hapticbridge.kernel.shown_tool import (
     SHOWN_DTYPE,
@@ -99,7 +100,6 @@ from hapticbridge.kernel.tick_guard import (
     set_commanded,
 )
 from hapticbridge.kernel.timing import TIMING_DTYPE
-from hapticbridge.record import TICK_DTYPE
 
 MujocoStep = Callable[[mujoco.MjModel, mujoco.MjData], None]
 
@@ -283,7 +283,7 @@ class BoundKernel:
 
         Args:
             parameters: Parameters of the run with the new coupling.
-            gains: Gains of its actuators (``rendering.Method.gains``).
+            gains: Gains of its actuators (``methods.Method.gains``).
             ticks: Length of the change in ticks, >= 1.
         """
         set_tuning_goal(self._record["coupling"], parameters, gains, ticks)
@@ -499,7 +499,7 @@ class BoundHands:
 def _whole_gains(model: mujoco.MjModel, parameters: RunParameters, hand: int) -> tuple[float, ...]:
     """Returns the whole gains of a hand's actuators, for forces and then for torques."""
     if parameters.scheme == Scheme.MIDPOINT:
-        # the model may have half of them; ``rendering.Method`` refuses any other rule
+        # the model may have half of them; ``methods.Method`` refuses any other rule
         forces, torques = implicit_gains(parameters.coupling, model.opt.timestep)
         return (*forces, *torques)
     gains: list[float] = []

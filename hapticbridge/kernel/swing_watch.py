@@ -93,7 +93,6 @@ import math
 
 import numpy as np
 
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import (
     PROBED,
     RUNS_AWAY,
@@ -103,8 +102,9 @@ from hapticbridge.kernel.codes import (
     Part,
     State,
 )
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.pose import Vector, norm
+from hapticbridge.kernel.pose import Vector, norm
 
 BLOCK = 0.004
 """Length of a block in s, over which wrench and velocity are averaged. Longer blocks miss swings of

@@ -29,7 +29,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled, compiled_for_threads
 from hapticbridge.kernel.codes import (
     BAD_RESULT,
     BAD_SAMPLE,
@@ -67,10 +66,12 @@ from hapticbridge.kernel.handle import (
     take_handle_frames,
     turns_actuators_alone,
 )
+from hapticbridge.kernel.jit import compiled, compiled_for_threads
 from hapticbridge.kernel.law import (
     charge_lateness,
     command_handle_velocity,
     felt,
+    note_tool,
     retune,
     slack_of_step,
     slip,
@@ -114,19 +115,7 @@ from hapticbridge.kernel.passivity_controller import (
     observe_energy,
     within_energy_limit,
 )
-from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, finish_contacts, follow_speed
-from hapticbridge.kernel.shown_tool import hand_over, note_contacts, shown_wrench, take_over
-from hapticbridge.kernel.springs import restore_springs
-from hapticbridge.kernel.swing_watch import watch_device
-from hapticbridge.kernel.tick_guard import (
-    DEVICE_BUTTONS,
-    advance_share,
-    note_anchored,
-    refusal,
-    send_within,
-)
-from hapticbridge.kernel.timing import meter_debt, meter_delay, note_delay, skip_delay
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
     add,
@@ -141,6 +130,18 @@ from hapticbridge.pose import (
     subtract,
     vector_of,
 )
+from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, finish_contacts, follow_speed
+from hapticbridge.kernel.shown_tool import hand_over, note_contacts, shown_wrench, take_over
+from hapticbridge.kernel.springs import restore_springs
+from hapticbridge.kernel.swing_watch import watch_device
+from hapticbridge.kernel.tick_guard import (
+    DEVICE_BUTTONS,
+    advance_share,
+    note_anchored,
+    refusal,
+    send_within,
+)
+from hapticbridge.kernel.timing import meter_debt, meter_delay, note_delay, skip_delay
 
 LOOP_DTYPE = np.dtype(
     [
@@ -216,6 +217,7 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
         return code
     # the device may have moved during all the time since its last new sample
     interval = max(elapsed, s.run.period) + s.guard.time_since_sample
+    ticks = s.guard.consecutive_stale + 1
     observe_energy(s, moved, turned, interval)
     meter_device(s, moved, turned, interval)
     watch_device(s, moved, turned, interval)
@@ -232,9 +234,10 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
     max_stretch = max_twist = np.inf
     is_timed = s.run.has_law and s.guard.has_hand and s.loop.tick > s.guard.start_tick
     if is_timed:
-        charge_lateness(s, interval)
-        meter_delay(s, max(elapsed, s.run.period), interval)
+        charge_lateness(s, interval, ticks)
+        meter_delay(s, interval, ticks)
     else:
+        note_tool(s)
         skip_delay(s)
     if s.mj.metered_mocaps > 0 and s.run.scheme != Scheme.SHOWN:
         note_moved_mocap_bodies(s)

@@ -16,7 +16,6 @@ import math
 
 import numpy as np
 
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import (
     BACKWARDS,
     CLUTCH,
@@ -34,8 +33,9 @@ from hapticbridge.kernel.codes import (
     Part,
     State,
 )
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     Vector,
     add,
     dot,

@@ -28,7 +28,12 @@ term is not paid, so it is summed here, for translation and rotation each, as
 
     A_k = max(0, A_{k−1} + 3 κ (t_d/T) D_k²/τ_k − (b − N τ_k/T) d_k²/τ_k)
 
-d is the handle's motion with the device, D the larger one of this tick and the last. N has here
+d is the handle's motion with the device, D the larger one of this sample and the last.
+
+A sample may come in one of m ticks only. The forces of two samples then differ by the deflections
+of m ticks, and the form holds with them all. It asks for m κ in place of κ, and for b >= m N_m,
+N_m = N + (m − 1) (K T)²/(4 N), as ``theory.bounds.late_minimum_damping`` has it; τ is the time
+between two samples. Both are exact for B' = 0. N has here
 what a torque across the motion costs (``law.twist_price``), but not in κ. Each joule
 that b burns is counted once: first against the cost of late samples, whose sum is ``lent``, then
 against A.
@@ -38,8 +43,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import State
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import lateness
 
 TIMING_DTYPE = np.dtype(
@@ -50,7 +55,7 @@ TIMING_DTYPE = np.dtype(
         ("jitter", "<f8"),  # sum of all rises of the lateness in s
         ("lent", "<f8", 2),  # energies in J in the scene, of translation and rotation
         ("uncovered", "<f8", 2),  # A
-        ("last_square", "<f8", 2),  # d² of the last tick in m² and rad²
+        ("last_square", "<f8", 2),  # d² of the last sample in m² and rad²
         ("max_uncovered", "<f8"),  # largest sum of A and of what is owed so far, in J at the hand
     ]
 )
@@ -71,24 +76,25 @@ def note_delay(s: State, deadline_ns: int, read_ns: int, write_ns: int) -> None:
 
 
 @compiled
-def meter_delay(s: State, elapsed: float, interval: float) -> None:
-    """Adds the energy that the last tick's delay may have given.
+def meter_delay(s: State, interval: float, ticks: int) -> None:
+    """Adds the energy that the last tick's delay may have given, in a tick with a new sample.
 
     Args:
         s: The bound state, with the handle's new step.
-        elapsed: Time since the last sample in s, at least T.
-        interval: Time since the last sample that was new, in s.
+        interval: τ, time since the last sample that was new, in s.
+        ticks: m, ticks in this time.
     """
     t = s.timing
+    if s.guard.consecutive_stale > 0:
+        return
     for kind in range(2):
-        stiffness, needed, lacking, square = lateness(s, kind, interval)
-        late = lacking * square
+        stiffness, needed, late, square = lateness(s, kind, interval, ticks)
         paying = min(t.lent[kind] + late, 0.0)
         t.lent[kind] = max(t.lent[kind] + late, 0.0)
         cost = 0.0
         if stiffness > 0.0:
             half = 0.5 * stiffness
-            cost = DELAY_PRICE * half * half / needed * t.delay / elapsed
+            cost = ticks * DELAY_PRICE * half * half / needed * t.delay / interval
         cost *= max(square, t.last_square[kind])
         t.uncovered[kind] = max(t.uncovered[kind] + cost + paying, 0.0)
         t.last_square[kind] = square

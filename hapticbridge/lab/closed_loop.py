@@ -18,20 +18,20 @@ from numpy.typing import NDArray
 
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import Method, prepare, resolve_contact_stiffness
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.simulated.dynamics import STATE_DTYPE as DEVICE_DTYPE
 from hapticbridge.device.simulated.dynamics import next_sample
 from hapticbridge.errors import StudyError
-from hapticbridge.jit import compiled, compiled_for_threads, direct
 from hapticbridge.kernel.codes import State
+from hapticbridge.kernel.jit import compiled, compiled_for_threads, direct
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at, without_timers
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.kernel.state import STATE_DTYPE, BoundKernel
 from hapticbridge.kernel.tick import shown_tick, whole_tick
-from hapticbridge.options import RunSetup
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.rendering import Method, prepare, resolve_contact_stiffness
+from hapticbridge.run.options import RunSetup
+from hapticbridge.run.summary import Ledger
 from hapticbridge.scene import Scene
-from hapticbridge.summary import Ledger
 from hapticbridge.theory.sampled_loop import decays
 
 PARTS = 16

@@ -2,7 +2,7 @@
 
 To add a method that exists only to be compared:
 
-1. Here, add a ``rendering.Method`` to ``_COMPARED``. If the theory of a free tool is known, add an
+1. Here, add a ``methods.Method`` to ``_COMPARED``. If the theory of a free tool is known, add an
    entry to ``THEORIES``, which the maps ``coupling`` and ``tool_mass`` show.
 2. For a new path of the wrench, add a number to ``kernel.codes.Scheme`` with its
    ``SchemeProperties``, and a branch to ``drive_compared`` and ``compared_wrench`` of
@@ -11,7 +11,7 @@ To add a method that exists only to be compared:
    audit computes every wrench again, and its gains to ``kernel.law.slack_gains`` and
    ``audit.energy``. A path without a law has ``has_law=False`` and needs neither.
 
-``rendering`` has the recipe for a method of the product.
+``methods`` has the recipe for a method of the product.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from __future__ import annotations
 from functools import partial
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import METHODS, Method
 from hapticbridge.kernel.codes import Scheme
 from hapticbridge.kernel.law import Gains, no_gains
-from hapticbridge.rendering import METHODS, Method
 from hapticbridge.scene.checks import check_massless_tool
 from hapticbridge.scene.handle import check_weldable
 from hapticbridge.theory.bounds import IMPLICIT_SHARE

@@ -321,8 +321,7 @@ def _usb() -> Finding:
     if problems:
         return Finding(name, False, "; ".join(problems), "hapticbridge devices")
     if unseen:
-        sentence, _, remedy = unseen[0].partition(": ")
-        return Finding(name, False, sentence, remedy.strip("'"))
+        return Finding(name, False, *unseen[0])
     if not plugged:
         return Finding(name, None, "no haptic device is plugged in")
     return Finding(name, True, f"may be opened: {', '.join(map(str, plugged))}")

@@ -27,15 +27,15 @@ from numpy.typing import ArrayLike
 
 from hapticbridge.clock import Clock, RealClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import Method, unguarded_parameters
 from hapticbridge.errors import HapticBridgeError, SceneError
-from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.kernel.parameters import MAX_SCENE_TICKS
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
-from hapticbridge.record import SAMPLE_DTYPE
-from hapticbridge.rendering import Method, unguarded_parameters
 from hapticbridge.scene import Scene
 
 # Time stolen by the host of a virtual machine

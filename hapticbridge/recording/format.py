@@ -28,7 +28,7 @@ import numpy as np
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import read_json
-from hapticbridge.record import FORMAT, TICK_DTYPE, columns_of
+from hapticbridge.kernel.record import FORMAT, TICK_DTYPE, columns_of
 
 TICK_TOPIC = "/tick"
 EVENT_TOPIC = "/event"

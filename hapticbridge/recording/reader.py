@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.files import import_extra, read_json
-from hapticbridge.record import FLAG_LEGEND, SECONDS, TICK_DTYPE, TableColumns
+from hapticbridge.kernel.record import FLAG_LEGEND, SECONDS, TICK_DTYPE, TableColumns
 from hapticbridge.recording import format as layout
 from hapticbridge.recording import ros_messages
 from hapticbridge.recording.container import MAGIC, Block, Container, DamageError, Fields, FileBytes

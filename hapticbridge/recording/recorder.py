@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import remove_file
-from hapticbridge.record import TickFlag
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.reader import read_hands, read_with_attachments

@@ -29,7 +29,7 @@ from rich.text import Text
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import remove_file
-from hapticbridge.record import TickFlag
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording.format import Attachment, further_hands
 from hapticbridge.recording.ring import Ring
 from hapticbridge.recording.writer import RecordingWriter
@@ -283,14 +283,14 @@ class _Session:
         """Writes the events that arrived; returns how the run ended, or None."""
         while True:
             try:
-                message = inbox.get_nowait()
+                event = inbox.get_nowait()
             except Empty:
                 return None
-            if message is None:
+            if event is None:
                 return "died"
-            if "close" in message:
+            if "close" in event:
                 return "closed"
-            self._write_event(message, message["time_ns"])
+            self._write_event(event, event["time_ns"])
 
     def _write_event(self, event: dict[str, Any], time_ns: int) -> None:
         if self._writer is not None:

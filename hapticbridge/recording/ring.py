@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.record import TICK_DTYPE
+from hapticbridge.kernel.record import TICK_DTYPE
 
 if TYPE_CHECKING:
     import mujoco

@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.record import FORMAT, TICK_DTYPE
+from hapticbridge.kernel.record import FORMAT, TICK_DTYPE
 from hapticbridge.recording import format as layout
 from hapticbridge.recording import ros_messages
 from hapticbridge.recording.format import Attachment

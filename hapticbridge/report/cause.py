@@ -15,21 +15,20 @@ from numpy.typing import NDArray
 from hapticbridge.audit import AuditReport
 from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.motion import turn_between
-from hapticbridge.audit.replay import Resimulator
-from hapticbridge.certificate import DampingCondition, run_conditions
-from hapticbridge.commands import UNITS
+from hapticbridge.audit.recorded_scene import bounds_for, compile_recorded
+from hapticbridge.audit.replay import Agreement, Resimulator
 from hapticbridge.confinement import Worker, in_bounds
+from hapticbridge.demand.certificate import DampingCondition, run_conditions
+from hapticbridge.demand.loop_setting import Lag, delay_ticks, required_damping
+from hapticbridge.demand.methods import Method
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.guard import may_be_pumped
-from hapticbridge.loop_setting import Lag, delay_ticks, required_damping
-from hapticbridge.record import TickFlag
-from hapticbridge.recorded_scene import bounds_for, compile_recorded
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
-from hapticbridge.rendering import Method
 from hapticbridge.report.evidence import Evidence
+from hapticbridge.run.commands import UNITS
 from hapticbridge.scene.checks import first_pump
-from hapticbridge.scene.contacts import check_contacts, geom_name
+from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
 from hapticbridge.theory.bounds import NEEDED_SHARE
 from hapticbridge.units import format_energy
 
@@ -247,7 +246,7 @@ def touched_pairs(
     """
     if evidence.model is None:
         return None
-    if not report.resimulation or report.resimulation.startswith(("not", "disagrees")):
+    if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
         return None
     ticks, total = evidence.ticks, float(gained.sum())
     found: defaultdict[frozenset[int], float] = defaultdict(float)
@@ -295,13 +294,13 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
         )
     pump = None if evidence.model is None else first_pump(evidence.model)
     # a motor's work is no creation, until its motion is beyond all measure
-    if pump is not None and (pump.kind == "joint" or "trip" in report.events):
+    if pump is not None and (pump.kind == "joint" or report.trip is not None):
         return Cause("pump", f"{pump.words}; {where}", f"write {pump.change}")
     if share < MOST:
         return _cause_without_contact(evidence, window, where)
     if concerns := _concerns(evidence, pairs):
-        concern, _, remedy = concerns[0].rpartition("; write ")
-        return Cause("contact setting", f"{where}; {concern}", f"write {remedy}")
+        first = concerns[0]
+        return Cause("contact setting", f"{where}; {first.words}", f"write {first.change}")
     if method.hazard:
         return _method_cause(method, "the contacts are set as recommended; ")
     hard = "a light tool on a stiff coupling is the hard case"
@@ -345,7 +344,7 @@ def _pair_words(evidence: Evidence, pairs: Pairs) -> str:
     return f", {share:.0%} while {touching}{more}"
 
 
-def _concerns(evidence: Evidence, pairs: Pairs | None) -> list[str]:
+def _concerns(evidence: Evidence, pairs: Pairs | None) -> list[Concern]:
     """Returns concerns about the contacts that touched; about all contacts if unknown."""
     if evidence.model is None:
         return []
@@ -452,8 +451,8 @@ def pump_behind_trip(
     An active run has a cause of its own (``likely_cause``). A run of several hands has none, nor a
     trip for a fault of the device. ``in_process`` is as for ``likely_cause``.
     """
-    has_tripped = "trip" in report.events and report.verdict != "active"
-    if not has_tripped or not may_be_pumped(report.reason) or recording.hands > 1:
+    trip = None if report.verdict == "active" else report.trip
+    if trip is None or not trip.may_be_pumped or recording.hands > 1:
         return None
     work = format_energy(report.energies.get("actuator_work", 0.0))
 

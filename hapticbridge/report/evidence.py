@@ -14,15 +14,15 @@ from hapticbridge.audit import AuditReport
 from hapticbridge.audit.energy import energy_balances
 from hapticbridge.audit.events import AuditedRun, AuditState
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import Method, RunCoupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.record import due_times
+from hapticbridge.kernel.record import due_times
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
-from hapticbridge.rendering import Method, RunCoupling
-from hapticbridge.run_description import method_of, parameters_of, requested_of
-from hapticbridge.summary import was_always_implicit
+from hapticbridge.run.description import method_of, parameters_of, requested_of
+from hapticbridge.run.summary import was_always_implicit
 
 DRAWABLE = 1e9
 """Largest magnitude in N, m or J that is drawn; a larger one is not physical and breaks the plot's

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
+from hapticbridge.demand.guard import CONTROLLERS
 from hapticbridge.device import DATA_SHEET_UNITS
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import atomic_write, read_json
-from hapticbridge.guard import CONTROLLERS
+from hapticbridge.kernel.record import TickFlag, due_times
 from hapticbridge.plotting import inline_svg
-from hapticbridge.record import TickFlag, due_times
 from hapticbridge.recording import Recording
 from hapticbridge.report.cause import excess_of, pump_behind_trip
 from hapticbridge.report.evidence import Evidence
@@ -30,7 +30,7 @@ from hapticbridge.report.plots import (
     draw_recording,
     draw_timing,
 )
-from hapticbridge.run_description import meta_float
+from hapticbridge.run.description import meta_float
 from hapticbridge.units import energy_rows, format_share, format_si, format_wrenches
 
 # Facts of the run
@@ -189,15 +189,10 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
         ("largest force", format_wrenches(None if evidence.info.is_prescribed else hand, tool)),
         ("controller", _controller_words(evidence)),
     ]
-    kept = report.timekeeping
-    borne = {True: "bears the coupling", False: "does not bear it", None: "not judged"}
-    words = borne[report.certified]
-    if kept is not None and report.certified is not None:
-        refutation = kept.refutation(report.hand_energy)
-        words = words + kept.clause if report.certified else refutation or words
-    facts.append(("device condition", words))
-    if kept is not None and kept.remark:
-        facts.append(("time kept", kept.remark))
+    if (found := report.certification) is not None:
+        facts.append(("device condition", found.fact))
+        if found.kept.remark:
+            facts.append(("time kept", found.kept.remark))
     if report.slack_share:
         facts.append(("slack used", format_share(report.slack_share)))
     return [*facts, ("simulated again", report.resimulation or "not reached")]
@@ -334,10 +329,10 @@ def lead_sentence(report: AuditReport, worst: float | None) -> str:
     ``worst`` is the largest energy beyond the bound in J; None if unknown.
     """
     if report.verdict == "invalid":
-        return f"This recording proves nothing: {report.reason}"
+        return f"This recording proves nothing: {report.sentence}"
     if report.verdict == "active" and worst is not None:
         return _excess_sentence(report, format_si(worst, "J"))
-    return report.reason.partition("; ")[0]
+    return report.sentence
 
 
 def _excess_sentence(report: AuditReport, joules: str) -> str:
@@ -352,34 +347,17 @@ def notes(report: AuditReport) -> list[str]:
     if report.verdict == "invalid":
         return []
     warned = [f"The run warned: {sentence}." for sentence in report.findings]
-    remarks = report.reason.partition("; ")[2]
     # a run that was passive only because its force was switched off must not look like any other
+    remarks = "; ".join(report.remarks)
     stop = [f"{remarks[:1].upper()}{remarks[1:]}."] if remarks else []
-    return [*stop, *_device_notes(report), *warned]
+    found = report.certification
+    device = [found.note] if found and report.verdict == "passive" else []
+    return [*stop, *device, *warned]
 
 
 def is_warned(report: AuditReport) -> bool:
     """Returns True for a passive run that was stopped or is not certified for any hand."""
-    return report.verdict == "passive" and (report.certified is False or "trip" in report.events)
-
-
-def _device_notes(report: AuditReport) -> list[str]:
-    if report.verdict != "passive":
-        return []
-    kept = report.timekeeping
-    if report.certified:
-        clause = "" if kept is None or not kept.clause else f",{kept.clause}"
-        limit = f"; but {report.hand_energy.limit}" if report.hand_energy.limit else ""
-        return [f"The device bears this coupling, in any hand{clause}{limit}."]
-    if report.certified is None:
-        slowness = "" if kept is None else kept.slowness
-        return [f"It is not known if the device bears this coupling in any hand{slowness}."]
-    if kept is not None and kept.refutation(report.hand_energy):  # the reason has the numbers
-        return ["The device is not certified. This run stayed passive; another one need not."]
-    return [
-        f"The device does not bear this coupling: {'; '.join(report.conditions)}. This run stayed "
-        "passive; another one need not."
-    ]
+    return report.verdict == "passive" and (report.certified is False or report.trip is not None)
 
 
 def telling_time(recording: Recording, report: AuditReport | None = None) -> float:
@@ -423,7 +401,7 @@ def write_report(
     write_page(
         path,
         "report.html",
-        report=asdict(report),
+        report=report,
         name=report.path.name,
         details={
             "Run": run_facts(meta),

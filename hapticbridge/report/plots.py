@@ -12,11 +12,11 @@ from hapticbridge.audit import AuditReport
 from hapticbridge.audit.motion import turn_between
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import printable
+from hapticbridge.kernel.record import TickFlag, due_times, force_on_hand, has_flag
 from hapticbridge.plotting import new_figure, write_picture
-from hapticbridge.record import TickFlag, due_times, force_on_hand, has_flag
 from hapticbridge.recording import Recording
 from hapticbridge.report.evidence import DRAWABLE, Evidence, is_motion_prescribed, recorded_coupling
-from hapticbridge.run_description import method_of, parameters_of
+from hapticbridge.run.description import method_of, parameters_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -151,8 +151,10 @@ def _draw_hand(
     for axes in panels:
         finish(axes)
     if has_several_hands:
-        head = f"{printable(parameters.grip)}: {_coupling_sentence(recording)}"
-        head = head.partition(" effective")[0]
+        found = recorded_coupling(recording)
+        shown = found.effective or found.law
+        gains = f"K = {shown.stiffness:.4g} N/m, B = {shown.damping:.3g} N s/m" if shown else ""
+        head = f"{printable(parameters.grip)}: {gains}"
         force_axes.set_title(head, fontsize="small", loc="left", pad=46, parse_math=False)
 
 

@@ -241,6 +241,23 @@ def suggested_solref(timestep: float) -> str:
     return f'solref="{SUGGESTED[0] * timestep:g} {SUGGESTED[1]:g}"'
 
 
+class Concern(NamedTuple):
+    """Risk of a contact's setting.
+
+    Attributes:
+        words: The fault and the risk.
+        change: What to write instead.
+        is_cone: True if the cone of friction is the fault, one option for all contacts.
+    """
+
+    words: str
+    change: str
+    is_cone: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.words}; write {self.change}"
+
+
 def contact_concerns(
     solref: Sequence[float],
     solimp: Sequence[float],
@@ -252,8 +269,8 @@ def contact_concerns(
     condim: int = 3,
     friction: float = 1.0,
     only_active: bool = False,
-) -> list[str]:
-    """Returns the risks of a contact setting, one clause each; empty for a recommended setting.
+) -> list[Concern]:
+    """Returns the risks of a contact setting; empty for a recommended setting.
 
     Args:
         solref: As for ``contact_numbers``, which raises the errors.
@@ -268,7 +285,7 @@ def contact_concerns(
         only_active: If true, only risks that are likely to exceed the slack are returned.
 
     Returns:
-        Clauses that follow "the contact of …": the fault, the risk, and what to write instead.
+        Risks whose words follow "the contact of …".
     """
     numbers = contact_numbers(solref, solimp, timestep, refsafe=refsafe)
     # + 0.0 turns a negative zero into 0
@@ -276,33 +293,46 @@ def contact_concerns(
     concerns = []
     if numbers.grade == "active" and numbers.is_too_stiff:
         concerns.append(
-            f"has {_excess(numbers)} than any that stayed passive in tests, and may create more "
-            f"energy than the coupling's slack allows; write {instead} and "
-            'solimp="0.9 0.95 0.001"'
+            Concern(
+                f"has {_excess(numbers)} than any that stayed passive in tests, and may create "
+                "more energy than the coupling's slack allows",
+                f'{instead} and solimp="0.9 0.95 0.001"',
+            )
         )
     elif numbers.grade == "active":
         concerns.append(
-            f"relaxes within {steps:.2g} time steps (2 d_w timeconst dampratio²) and may create "
-            f"more energy than the coupling's slack allows; write {instead}, or for a tool of 0.1 "
-            f'kg or more solref="{REFERENCE_STEPS * timestep:g} 1" solimp="0.9 0.95 0.001"'
+            Concern(
+                f"relaxes within {steps:.2g} time steps (2 d_w timeconst dampratio²) and may "
+                "create more energy than the coupling's slack allows",
+                f"{instead}, or for a tool of 0.1 kg or more "
+                f'solref="{REFERENCE_STEPS * timestep:g} 1" solimp="0.9 0.95 0.001"',
+            )
         )
     if cone == "pyramidal" and condim > 1 and friction < LOW_FRICTION:
         concerns.append(
-            f"has a pyramidal cone and a friction of {friction:g}, below {LOW_FRICTION:g}, and may "
-            "create several times the energy that the coupling's slack allows; write "
-            'cone="elliptic" in <option>, or condim="1" for no friction'
+            Concern(
+                f"has a pyramidal cone and a friction of {friction:g}, below {LOW_FRICTION:g}, and "
+                "may create several times the energy that the coupling's slack allows",
+                'cone="elliptic" in <option>, or condim="1" for no friction',
+                is_cone=True,
+            )
         )
     if only_active:
         return concerns
     if numbers.grade != "strict" and not diagexact:
         concerns.append(
-            "is solved with MuJoCo's approximate diagonal, with which more runs created energy; "
-            'write <flag diagexact="enable"/> in <option>'
+            Concern(
+                "is solved with MuJoCo's approximate diagonal, with which more runs created energy",
+                '<flag diagexact="enable"/> in <option>',
+            )
         )
     if numbers.resolved > SOFT_STEPS * (1 + ROUNDING):
         concerns.append(
-            f"is soft: a steady force sinks in {numbers.softness:.3g} times as deep as with "
-            f'solref="{REFERENCE_STEPS * timestep:g} 1"; write {instead} unless this is intended'
+            Concern(
+                f"is soft: a steady force sinks in {numbers.softness:.3g} times as deep as with "
+                f'solref="{REFERENCE_STEPS * timestep:g} 1"',
+                f"{instead} unless this is intended",
+            )
         )
     return concerns
 
@@ -354,7 +384,7 @@ def check_contacts(
     *,
     is_thorough: bool = False,
     only: Collection[frozenset[int]] | None = None,
-) -> list[str]:
+) -> list[Concern]:
     """Returns the concerns about all contacts that the tool can have.
 
     Flexes, and the ``solreffriction`` of pairs, are not checked.
@@ -375,8 +405,11 @@ def check_contacts(
             names_by_setting.setdefault(setting, []).append(names)
     step = float(option.timestep)
     return [
-        f"the contact of {names[0]}{_others(len(names) - 1)} (solref {_words(setting.solref)}, "
-        f"solimp {_words(setting.solimp[:3])}, time step {step:g} s) {concern}"
+        concern._replace(
+            words=f"the contact of {names[0]}{_others(len(names) - 1)} "
+            f"(solref {_words(setting.solref)}, solimp {_words(setting.solimp[:3])}, time step "
+            f"{step:g} s) {concern.words}"
+        )
         for setting, names in names_by_setting.items()
         for concern in contact_concerns(
             setting.solref,

@@ -22,8 +22,8 @@ from hapticbridge.kernel.codes import (
 )
 from hapticbridge.kernel.colliders import use_exact_points
 from hapticbridge.kernel.mujoco_c import warning_of
+from hapticbridge.kernel.pose import IDENTITY_POSE
 from hapticbridge.kernel.rigid_contact import IMPRATIO, LARGEST_MARGIN, MARGIN, largest_margin
-from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.scene.compile import clause, compiled, go_to_start
 from hapticbridge.scene.contacts import announce_soft_equalities
 from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains

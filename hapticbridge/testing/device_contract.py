@@ -40,8 +40,8 @@ from numpy.typing import NDArray
 from hapticbridge.clock import Clock, RealClock
 from hapticbridge.device.base import AXES, JUMP_MARGIN, Device, DeviceInfo
 from hapticbridge.errors import DeviceError
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.kernel.tick_guard import FARTHEST
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
 PERIOD, TICKS = 1e-3, 300
 """Period of the loop in s, and number of ticks in each run."""

@@ -293,9 +293,10 @@ def late_minimum_damping(
     ripples = np.sin(0.5 * np.outer([samples + 1, samples + 2], theta)) ** 2
     lag = np.array([[1.0, 0.0], [1.0 - part, part]]) @ ripples  # of the whole part, and of t_d
     slow = lag / np.sin(0.5 * theta) ** 2
-    beta = law_damping[..., None, None] / period
-    gain = (0.25 * n * k**2 * slow + (k * beta + beta**2) * lag).max(axis=(-2, -1))
-    needed = n * period * gain / (0.5 * k + law_damping / period)
+    beta = law_damping / period
+    # one by one: all at once would hold every ratio at every angle, 133 MB at a delay of 50 samples
+    gain = [(0.25 * n * k**2 * slow + (k * each + each**2) * lag).max() for each in beta.flat]
+    needed = n * period * np.reshape(gain, beta.shape) / (0.5 * k + beta)
     return plain(np.asarray(needed))
 
 

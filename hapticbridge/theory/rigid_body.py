@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from hapticbridge.arguments import LARGEST, Arguments, Array
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import MechanicsError
-from hapticbridge.jit import compiled
-from hapticbridge.pose import (
+from hapticbridge.kernel.jit import compiled
+from hapticbridge.kernel.pose import (
     Vector,
     add,
     cross,

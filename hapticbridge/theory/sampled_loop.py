@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticbridge.arguments import LARGEST, SMALLEST, shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
-from hapticbridge.jit import compiled
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.theory.spectrum import needed_for_fixed_environment
 from hapticbridge.theory.transfer import (
     DISCRETIZATIONS,

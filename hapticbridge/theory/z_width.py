@@ -23,7 +23,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.theory.bounds import DAMPING_SHARE, STIFFNESS_MARGIN
+from hapticbridge.theory.bounds import (
+    DAMPING_SHARE,
+    NEEDED_SHARE,
+    STIFFNESS_MARGIN,
+    stiffest_late_coupling,
+)
 from hapticbridge.theory.spectrum import wall_supremum
 from hapticbridge.theory.transfer import checked, delayed_by, plain, scalar, single, together, whole
 
@@ -346,6 +351,7 @@ _Array = NDArray[np.float64]
 
 ANY_HAND = "passive for any hand"
 WALL = "passive against a wall"
+BEHIND_DELAY = "passive for any hand behind the delay"
 NO_LIMIT_CYCLES = "free of limit cycles"
 WITHOUT_HAND = "stable without a hand"
 
@@ -362,7 +368,7 @@ MARGIN_OF_RANGE = 1.25
 region that is not passive."""
 
 _CYCLES = "limit cycles, which stay bounded as long as K < 2b/T"
-_DELAYED = "with a delay the bound is that of a wall; 'hapticbridge bound' has that of every scene"
+_DELAYED = "with a delay the lines are those of a wall; the coupling to use holds for every scene"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -395,8 +401,9 @@ class ZWidth:
         limit: Smallest K in N/m over the required lines, shape (n,).
         limited_by: Name of that line at each B.
         corner: Recommended coupling in translation (rotational part 0). B is a quarter of the limit
-            at K → 0, K is 80 % of the limit at that B.
-        corner_limited_by: Name of the line above the corner.
+            at K → 0, K is 80 % of the limit at that B. With a delay it is that of
+            ``bounds.stiffest_late_coupling``.
+        corner_limited_by: Name of the line above the corner, or of the bound behind a delay.
         notes: Sentences about effects that the lines do not cover.
         device_damping: b in N s/m.
         period: T in s.
@@ -442,8 +449,9 @@ def z_width(
         stable without a hand    ``free_device_stiffness``              m_d known
 
     Without a delay the first line is sufficient for any passive hand and any environment that is
-    discrete-time passive. **With a delay no bound holds for a general environment**: the line
-    against a wall is necessary but not sufficient, and the energy meter must decide.
+    discrete-time passive. With a delay the line against a wall is necessary but not sufficient for
+    a general environment. The recommended coupling then needs 85 % of b by the bound that suffices,
+    ``bounds.late_minimum_damping``; it has no low-pass.
 
     The friction line holds for a loop without delay and low-pass; a low-pass makes the damper's
     jumps smaller. It is required only if f_c T/Δ reaches ``MIN_FRICTION_SHARE`` of b. Otherwise a
@@ -500,13 +508,21 @@ def z_width(
     required.sort(key=lambda line: line.largest_damping)
     rows = np.stack([line.stiffness for line in required])
     least, limit = rows.argmin(axis=0), rows.min(axis=0)
+    corner = STIFFNESS_MARGIN * float(limit[-1]), float(damping[-1])
+    limited_by = required[least[-1]].name
+    if delay and not loop.filter_time:
+        stiff, damped = stiffest_late_coupling(loop.b, loop.period, delay * loop.period, 1)
+        needed = 0.5 * stiff * loop.period + damped  # of f_c T/Δ
+        share = min(NEEDED_SHARE * allowed / needed, 1.0) if allowed and is_kept else 1.0
+        corner = share * stiff, share * damped
+        limited_by = BEHIND_DELAY if share == 1.0 else NO_LIMIT_CYCLES
     return ZWidth(
         damping=grid,
         lines=tuple(replace(line, stiffness=line.stiffness[:-1]) for line in lines),
         limit=limit[:-1],
         limited_by=tuple(required[index].name for index in least[:-1]),
-        corner=Coupling(STIFFNESS_MARGIN * float(limit[-1]), float(damping[-1]), 0.0, 0.0),
-        corner_limited_by=required[least[-1]].name,
+        corner=Coupling(*corner, 0.0, 0.0),
+        corner_limited_by=limited_by,
         notes=tuple(note for note in (_DELAYED if delay else "", of_friction) if note),
         device_damping=loop.b,
         period=period,

@@ -18,7 +18,19 @@ from typing import Any
 import numpy as np
 import viser
 
-from hapticbridge.commands import (
+from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import RunCoupling
+from hapticbridge.device.mouse import REST, Pose, line_of_pose
+from hapticbridge.errors import CommandError
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.pose import (
+    conjugate,
+    product,
+    quaternion_exp,
+    quaternion_of,
+    rotation_between,
+)
+from hapticbridge.run.commands import (
     INTERVAL,
     UNITS,
     AxisCouplingLimits,
@@ -31,19 +43,7 @@ from hapticbridge.commands import (
     Switch,
     line_of,
 )
-from hapticbridge.coupling import Coupling
-from hapticbridge.device.mouse import REST, Pose, line_of_pose
-from hapticbridge.errors import CommandError
-from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.pose import (
-    conjugate,
-    product,
-    quaternion_exp,
-    quaternion_of,
-    rotation_between,
-)
-from hapticbridge.rendering import RunCoupling
-from hapticbridge.request import setups_of
+from hapticbridge.run.request import setups_of
 from hapticbridge.view.page import quoted
 from hapticbridge.view.window import HAND_INTERVAL
 

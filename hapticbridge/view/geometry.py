@@ -15,8 +15,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.run.summary import is_always_implicit
 from hapticbridge.scene.physics import matrix_of, mesh_of
-from hapticbridge.summary import is_always_implicit
 
 Array = NDArray[np.float64]
 

@@ -13,12 +13,12 @@ import numpy as np
 import viser
 from numpy.typing import ArrayLike, NDArray
 
+from hapticbridge.demand.methods import RunCoupling
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import printable
-from hapticbridge.film_process import MIN_REFERENCE, force_colour, is_held
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.rendering import RunCoupling
-from hapticbridge.run_description import method_of, requested_of
+from hapticbridge.replay.stage import MIN_REFERENCE, force_colour, is_held
+from hapticbridge.run.description import method_of, requested_of
 from hapticbridge.scene.physics import matrix_of
 from hapticbridge.units import format_forces, format_si
 from hapticbridge.view.geometry import (

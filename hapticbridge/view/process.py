@@ -22,15 +22,15 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit.recorded_scene import compile_recorded
+from hapticbridge.demand.timekeeping import Alarm
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.film_process import MIN_REFERENCE, is_held, tell_apart
-from hapticbridge.record import force_on_hand
-from hapticbridge.recorded_scene import compile_recorded
+from hapticbridge.kernel.record import force_on_hand
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.format import further_hands
 from hapticbridge.recording.ring import Snapshot
-from hapticbridge.run_description import parameters_of
-from hapticbridge.timekeeping import watch_sentence
+from hapticbridge.replay.stage import MIN_REFERENCE, is_held, tell_apart
+from hapticbridge.run.description import parameters_of
 from hapticbridge.view.controls import Controls, Outlet, add_hand, allowance_of
 from hapticbridge.view.geometry import Scenery, Tendons
 from hapticbridge.view.page import Held, Page, Sight, Trace, quoted
@@ -169,7 +169,7 @@ def _calm() -> None:
 def _ending(event: dict[str, Any]) -> str:
     """Returns the reason of a run's end if an event contains it."""
     if event.get("event") == "trip" or (event.get("event") == "stop" and "overruns" in event):
-        return str(event.get("reason"))
+        return str(event.get("error") or event.get("reason"))
     return ""
 
 
@@ -190,9 +190,9 @@ def _follow(
             page.hand_reference = live.hand_reference
             page.tool_reference = live.tool_reference
             page.show(sight)
-            watched = watch_sentence(live.flags)
+            alarm = Alarm.of(live.flags)
             page.status.content = f"**{sight.time:.1f} s**, {page.forces(sight)}" + (
-                f"; **{watched}**" if watched else ""
+                f"; **{alarm.sentence}**" if alarm else ""
             )
         now = time.monotonic()
         if now - plotted >= REPLOT and len(live.trace) > 1:

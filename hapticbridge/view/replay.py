@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import viser
 
+from hapticbridge.audit.recorded_scene import bounds_for
 from hapticbridge.confinement import Worker, in_bounds
-from hapticbridge.film_process import MIN_REFERENCE, Stage, is_held
-from hapticbridge.recorded_scene import bounds_for
 from hapticbridge.recording import RecordingFile, open_recording
-from hapticbridge.run_description import parameters_of
+from hapticbridge.replay.stage import MIN_REFERENCE, Stage, is_held
+from hapticbridge.run.description import parameters_of
 from hapticbridge.view.geometry import Scenery, Tendons, checked
 from hapticbridge.view.page import Held, Page, Sight, Trace
 from hapticbridge.view.server import serve, stop

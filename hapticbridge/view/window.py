@@ -21,11 +21,11 @@ from typing import IO, cast
 from urllib.parse import parse_qs, urlsplit
 
 from hapticbridge.arguments import check_fields, option
-from hapticbridge.commands import INTERVAL, LONGEST_LINE, Command, command_of
 from hapticbridge.device.mouse import Pose, pose_of_line
 from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.files import install_command
 from hapticbridge.recording import Attachment
+from hapticbridge.run.commands import INTERVAL, LONGEST_LINE, Command, command_of
 from hapticbridge.signals import deferring_stops
 
 HOST = "127.0.0.1"

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.arguments import unit_of
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.methods import RunCoupling
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import printable
-from hapticbridge.guard import Limits
-from hapticbridge.hand_energy import INSTANT
 from hapticbridge.kernel.codes import Grip
+from hapticbridge.kernel.hand_energy import INSTANT
+from hapticbridge.kernel.record import due_times
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
-from hapticbridge.record import due_times
-from hapticbridge.rendering import RunCoupling
 from hapticbridge.report.evidence import (
     DRAWABLE,
     Evidence,
@@ -41,7 +41,7 @@ Row = tuple[str, tuple[str, ...]]
 
 def rows(found: WhatIf) -> Iterator[Row]:
     """Yields a name and a text per run, in the order of ``found.runs``."""
-    runs = found.runs
+    runs, reports = found.runs, [run.report for run in found.runs]
     for hand, grip in enumerate(runs[0].report.hands or ("",)):
         of_hand = [_coupling(run, hand) for run in runs]
         for name in ("effective", "law", "requested"):
@@ -54,7 +54,7 @@ def rows(found: WhatIf) -> Iterator[Row]:
                         for c in couplings
                     ),
                 )
-    yield "verdict", tuple(f"{r.report.words}, tripped" if r.trip else r.report.words for r in runs)
+    yield "verdict", tuple(f"{r.words}, tripped" if r.trip else r.words for r in reports)
     for name in runs[0].peaks:
         unit = unit_of(Limits, name.split()[0])
         yield f"peak {name}", tuple(format_si(run.peaks[name], unit) for run in runs)
@@ -66,7 +66,10 @@ def rows(found: WhatIf) -> Iterator[Row]:
     if any(run.report.max_net_energy > INSTANT for run in runs):
         yield "net to the hand", tuple(format_energy(run.report.max_net_energy) for run in runs)
     yield "slack used", tuple(format_share(run.report.slack_share) for run in runs)
-    yield "device bears it", tuple(map(_certified, runs))
+    yield (
+        "device bears it",
+        tuple(each.answer for each in reports),
+    )
     yield "ran", tuple(f"{run.report.duration:.3f} s" for run in runs)
 
 
@@ -89,15 +92,11 @@ def sentences(run: WhatIfRun) -> Iterator[str]:
     """Yields the reasons why a run is not passive and why it was stopped."""
     if run.report.verdict != "passive":
         yield run.report.reason
-    if run.trip:
-        yield f"tripped: {run.trip}"
-    kept = run.report.timekeeping
-    if run.report.certified is False and kept is not None:
-        yield kept.device_words(verdict=False, energy=run.report.hand_energy)
-
-
-def _certified(run: WhatIfRun) -> str:
-    return {True: "yes", False: "no", None: "not judged"}[run.report.certified]
+    if run.report.trip:
+        yield f"tripped: {run.report.trip.sentence}"
+    device = run.report.certification
+    if device and device.verdict is False:
+        yield device.words
 
 
 def _format_value(value: object) -> str:

@@ -11,17 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit.recorded_scene import unpack_scene
+from hapticbridge.demand.guard import USUAL_RAMP
+from hapticbridge.demand.trip import Trip
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import RecordingError
-from hapticbridge.guard import USUAL_RAMP
-from hapticbridge.hands import GripAxis
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.options import BridgeOptions, RunSetup
-from hapticbridge.record import TickFlag
-from hapticbridge.recorded_scene import unpack_scene
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recording
-from hapticbridge.request import RunRequest, request_of, setups_of
-from hapticbridge.run_description import parameters_of
+from hapticbridge.run.description import parameters_of
+from hapticbridge.run.hands import GripAxis
+from hapticbridge.run.options import BridgeOptions, RunSetup
+from hapticbridge.run.request import RunRequest, request_of, setups_of
 from hapticbridge.whatif.settings import Settings
 
 
@@ -96,10 +97,9 @@ class RecordedRun:
         return (*first["device_position"].tolist(), *first["device_quaternion"].tolist())
 
     @property
-    def trip(self) -> str:
-        """Reason of the guard's stop, or empty."""
-        trips = [e for e in self.recording.events if e.get("event") == "trip"]
-        return str(trips[0].get("reason", "unknown")) if trips else ""
+    def trip(self) -> Trip | None:
+        """The guard's stop, or None."""
+        return Trip.among(self.recording.events)
 
 
 def changed_request(hands: Sequence[RecordedRun], settings: Sequence[Settings]) -> RunRequest:

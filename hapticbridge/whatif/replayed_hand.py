@@ -6,7 +6,7 @@ import math
 import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
@@ -17,21 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.bridge import Bridge
+from hapticbridge.audit.recorded_scene import load_unpacked
 from hapticbridge.clock import Clock, SimulatedClock
-from hapticbridge.commands import CHANGES as COMMANDED
-from hapticbridge.commands import concerns, coupling_in, tuning_ticks
+from hapticbridge.demand.loop_setting import delay_ticks
+from hapticbridge.demand.trip import TripCode
 from hapticbridge.device import AXES, Device, DeviceInfo, Hand, Motion
 from hapticbridge.device.simulated.device import GrippingDevice, SimulatedDevice
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
 from hapticbridge.errors import SafetyTrip
-from hapticbridge.guard import trip_reason
-from hapticbridge.hands import Grasp
-from hapticbridge.kernel.codes import GAVE_ENERGY, STRETCHED, TWISTED, WARNINGS
-from hapticbridge.loop_setting import delay_ticks
-from hapticbridge.record import TickFlag
-from hapticbridge.recorded_scene import load_unpacked
-from hapticbridge.run_description import CARRIED, sample_at
+from hapticbridge.kernel.record import TickFlag
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.commands import CHANGES as COMMANDED
+from hapticbridge.run.commands import concerns, coupling_in, tuning_ticks
+from hapticbridge.run.description import CARRIED, sample_at
+from hapticbridge.run.hands import Grasp
 from hapticbridge.scene import Scene
 from hapticbridge.whatif.recorded import RecordedRun, changed_request
 from hapticbridge.whatif.settings import GAINS, Settings
@@ -287,7 +286,10 @@ def _solve_intent(
 
 # Repetition of a run's inputs, commands and pauses
 
-_BY_STATE = (STRETCHED, TWISTED, GAVE_ENERGY, *WARNINGS)
+_BY_STATE = (
+    *(TripCode.STRETCHED, TripCode.TWISTED, TripCode.GAVE_ENERGY),
+    *(TripCode.CONTACTS_FULL, TripCode.CONSTRAINTS_FULL),
+)
 """Trips caused by the state after the previous tick, at any sample; that tick can be repeated."""
 
 Event = Mapping[str, Any]
@@ -328,26 +330,23 @@ class Repetition:
         self._per_tick = 1.0
         self.warned: tuple[str, ...] = ()
 
-    def into(self, path: Path, devices: Sequence[Device], clock: Clock) -> tuple[float, str]:
-        """Runs into a file; returns the period in s, and the reason of the guard's stop or empty.
+    def into(self, path: Path, devices: Sequence[Device], clock: Clock) -> float:
+        """Runs into a file until its end or a trip; returns the period in s.
 
         Raises:
             HapticBridgeError: The changed bridge is refused; the message names the reason.
         """
         run, bridge = self._run, self._bridge(path, devices, clock)
         self._per_tick = run.period / bridge.period
-        trip = ""
         with warnings.catch_warnings(record=True) as caught, ExitStack() as stack:
             warnings.simplefilter("always", UserWarning)
             stack.enter_context(bridge)
-            try:
-                self._repeat(bridge)
-            except SafetyTrip as error:
-                trip = str(error)
+            stack.enter_context(suppress(SafetyTrip))  # the recording has it
+            self._repeat(bridge)
         # the temporary path of the unpacked scene means nothing to the reader
         messages = [str(each.message).replace(str(run.scene_file), "") for each in caught]
         self.warned = tuple(dict.fromkeys(text.removeprefix("scene '': ") for text in messages))
-        return bridge.period, trip
+        return bridge.period
 
     def scene(self) -> Scene:
         """Loads the scene with the parameters of the settings, and a handle per hand.
@@ -408,11 +407,8 @@ class Repetition:
         return [*pauses, len(self._run.ticks)]
 
     def _was_tripped_by_state(self) -> bool:
-        last = len(self._run.ticks)
-        grips = [hand.parameters.grip if self._has_several_hands else "" for hand in self._hands]
-        return self._run.trip in [
-            trip_reason(code, last, grip) for code in _BY_STATE for grip in grips
-        ]
+        trip = self._run.trip
+        return trip is not None and trip.tick == len(self._run.ticks) and trip.code in _BY_STATE
 
     def _action_for(self, event: Event) -> Event | None:
         """Returns the action that repeats a recorded event under these settings, or None."""

@@ -8,12 +8,12 @@ from typing import Any
 
 from hapticbridge.arguments import rule_of, shown, types_of, value_from
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.methods import Method, method_named
 from hapticbridge.errors import RecordingError, choices
-from hapticbridge.guard import Limits
 from hapticbridge.kernel.codes import Grip
-from hapticbridge.options import BridgeOptions, RunSetup, Workspace
-from hapticbridge.rendering import Method, method_named
-from hapticbridge.request import RunRequest
+from hapticbridge.run.options import BridgeOptions, RunSetup, Workspace
+from hapticbridge.run.request import RunRequest
 
 KEPT = {
     "axes": "the recorded motion is that of these axes",

@@ -16,19 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport, audit
+from hapticbridge.audit.recorded_scene import bounds_for, compile_recorded, is_as_recorded
 from hapticbridge.clock import Clock, SimulatedClock
-from hapticbridge.compare import compare
 from hapticbridge.confinement import Work, Worker, in_bounds
 from hapticbridge.device import Device
 from hapticbridge.device.registry import FINGERS_HAND
 from hapticbridge.device.simulated.device import scene_hand
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import finite_or_null
-from hapticbridge.record import TickFlag
-from hapticbridge.recorded_scene import bounds_for, compile_recorded, is_as_recorded
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import read_hands
 from hapticbridge.scene import Scene
+from hapticbridge.tools.compare import compare
 from hapticbridge.units import format_si
 from hapticbridge.whatif.recorded import RecordedRun
 from hapticbridge.whatif.replayed_hand import (
@@ -64,7 +64,6 @@ class WhatIfRun:
         report: The audit's verdict.
         peaks: Largest force and torque on hand and tool in N and N m, and largest distance of
             handle and tool in m, by name. Those on the hand are left out for a prescribed motion.
-        trip: Reason of the guard's stop, or empty.
         period: T in s.
         recordings: Its recording, once per hand; that of a changed run exists in memory only.
     """
@@ -72,7 +71,6 @@ class WhatIfRun:
     name: str
     report: AuditReport
     peaks: dict[str, float]
-    trip: str
     period: float
     recordings: tuple[Recording, ...]
 
@@ -110,7 +108,8 @@ class WhatIf:
     @property
     def exit_code(self) -> int:
         """Largest exit code of the changed runs; a trip counts as 1."""
-        return max(max(run.report.exit_code, int(bool(run.trip))) for run in self.runs[1:])
+        reports = [run.report for run in self.runs[1:]]
+        return max(max(each.exit_code, int(each.trip is not None)) for each in reports)
 
     def to_json(self) -> str:
         """Returns the result as one JSON object, without the ticks."""
@@ -124,7 +123,7 @@ class WhatIf:
                 {
                     "name": run.name,
                     "peaks": run.peaks,
-                    "trip": run.trip,
+                    "trip": run.report.trip and run.report.trip.sentence,
                     "report": json.loads(run.report.to_json()) | {"path": str(self.path)},
                 }
                 for run in self.runs
@@ -264,14 +263,14 @@ class _Experiment:
             )
         recordings = tuple(hand.recording for hand in self.hands)
         peaks = self._peaks(recordings)
-        recorded = WhatIfRun(RECORDED, self.report, peaks, run.trip, run.period, recordings)
+        recorded = WhatIfRun(RECORDED, self.report, peaks, run.period, recordings)
         runs = [recorded]
         self.steps.begin("the recorded motion")
         runs.append(self._prescribed(new))
         if not is_changed:
             notes.append(self._agreement())
         notes.extend(_missing_parts(run, Repetition(self.hands, new)))
-        if runs[0].trip:
+        if run.trip:
             notes.append("the recorded run ends in a trip, so these runs end there too")
         hand_error = math.nan
         if missing := self._missing_for_closed_loop():
@@ -344,20 +343,17 @@ class _Experiment:
             repetition = Repetition(self.hands, settings)
             scene = repetition.scene()
             worker.allow_run()
-            period, trip = repetition.into(path, devices_in(scene), clock)
-            return period, trip, repetition.warned
+            return repetition.into(path, devices_in(scene), clock), repetition.warned
 
         method, is_slow = new.method, new.options.scene_ticks > 0
         load_bridge_code(method.name, method.contact, is_slow, self.has_several_hands)
         steps = new.steps_per_second / run.settings.steps_per_second
-        period, trip, warned = self._in_bounds(work, max(1.0, steps))
+        period, warned = self._in_bounds(work, max(1.0, steps))
         if any(own != hand.settings for own, hand in zip(settings, self.hands, strict=True)):
             self.concerns |= dict.fromkeys(map(str, warned))
         recordings = read_hands(path)
         report = self.judge(path)
-        return WhatIfRun(
-            name, report, self._peaks(recordings), str(trip), float(period), recordings
-        )
+        return WhatIfRun(name, report, self._peaks(recordings), float(period), recordings)
 
     def _is_scene_as_recorded(self) -> bool:
         recording = self.run.recording

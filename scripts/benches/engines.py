@@ -55,6 +55,7 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge import load_scene
 from hapticbridge.device import Motion
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.tick import simulate
 from hapticbridge.lab.chart.chart import (
     Extent,
@@ -88,7 +89,6 @@ from hapticbridge.lab.engines.base import (
     open_engine,
 )
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.record import TICK_DTYPE
 
 RAMP, HOLD = 0.2, 1.2
 """Times in s to go to a push, and to stay: the damping leaves e⁻¹⁸ of the ringing."""

@@ -30,7 +30,7 @@ from argument_types import whole
 from model_runs import LOOP_SCENES
 from random_hands import random_motion
 
-from hapticbridge.certificate import default_coupling
+from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.simulated.device import scene_hand
 from hapticbridge.device.trajectory import read_motion

@@ -30,9 +30,9 @@ from test_kernel_shown_tool import Loop
 from tick_blocks import UnpacedClock
 
 from hapticbridge import SAMPLE_DTYPE, Coupling, DeviceInfo
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.recording import read_recording
+from hapticbridge.run.bridge import Bridge
 
 SPEED, WALL, DEPTH, MASS = 0.2, 0.01, 0.005, 0.05
 """Speed in m/s, way to the wall in m, way of the handle beyond it in m, mass of the tool in kg."""

@@ -61,7 +61,7 @@ def measure_cold() -> dict[str, float]:
         environment = os.environ | {"NUMBA_CACHE_DIR": folder}
         recording = str(Path(folder, "run.mcap"))
         steps = {
-            "setup": ["-m", "hapticbridge.programs"],
+            "setup": ["-m", "hapticbridge.run.programs"],
             "first_run": [*COMMANDS["run"], "--record", recording],
             "first_audit": ["-m", "hapticbridge", "audit", recording],
         }

@@ -47,11 +47,11 @@ from numpy.typing import NDArray
 from tick_blocks import BLOCK, UnpacedClock
 
 from hapticbridge import Bridge, Grasp, Scene, load_scene
-from hapticbridge.jit import direct
+from hapticbridge.demand.methods import prepare
+from hapticbridge.kernel.jit import direct
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
-from hapticbridge.record import SAMPLE_DTYPE
-from hapticbridge.rendering import prepare
 
 SCENES = {"point_mass": False, "peg_in_hole": True, "hex_key": True, "drawer": False}
 """Scenes, each with True if only ticks in contact count."""

@@ -1,7 +1,7 @@
 """The coupling becomes stiffer during a run, and no energy comes of it."""
 
 import hapticbridge as hb
-from hapticbridge.commands import Couple
+from hapticbridge.run.commands import Couple
 
 
 def on_tick(tick: int) -> None:

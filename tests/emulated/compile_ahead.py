@@ -15,11 +15,11 @@ from usb_tiers.benches import DAMPING, FRICTION, MASS, falcon
 
 from emulated.guest import CHECKOUT
 from emulated.virtual_usb import VirtualClock, VirtualLink, VirtualTime
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.device.falcon.device import FalconDevice
-from hapticbridge.hands import Grasp
-from hapticbridge.jit import cache_folder
+from hapticbridge.kernel.jit import cache_folder
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.hands import Grasp
 from hapticbridge.scene import own_grips, read_scene
 
 KEPT = {".nbi", ".nbc", ".o"}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import hapticbridge as hb
 from emulated.guest import GuestRun
-from hapticbridge.record import COLUMNS, Column
+from hapticbridge.kernel.record import COLUMNS, Column
 
 MAX_NAMED = 8
 """Number of columns named, of the first record that differs; the rest is counted.

@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faults.rig import CAUSE, PERIOD, PRESS, STALE, FaultyDevice, Outcome, Rig
-from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device.simulated.dynamics import DEFAULT_HAND, Hand
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.guard import Limits
 from hapticbridge.recording.recorder import recorder_process
 from hapticbridge.recording.ring import HEAD, TAIL
+from hapticbridge.run.bridge import Bridge
 from hapticbridge.theory.sampled_loop import WorstHand
 from hapticbridge.view.window import Address, Window
 
@@ -432,7 +432,7 @@ def _suspended(rig: Rig) -> None:
     asleep = 0
 
     def around(stack: ExitStack) -> None:
-        stack.enter_context(patch("hapticbridge.session.slept_ns", lambda: asleep))
+        stack.enter_context(patch("hapticbridge.run.session.slept_ns", lambda: asleep))
 
     def corrupt(tick: int, sample: NDArray[np.void]) -> int:
         nonlocal asleep

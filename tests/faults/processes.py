@@ -20,12 +20,12 @@ sys.path.insert(0, sys.argv[1])
 import numpy as np
 from emulated.hid_seam import HidSeam
 from emulated.rawhid_model import Claims, RawHid
-from hapticbridge.bridge import Bridge
+from hapticbridge.run.bridge import Bridge
 from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.rawhid.device import open_rawhid
 from hapticbridge.device.rawhid.protocol import force_frame
 from hapticbridge.device.watchdog import ForceOffGuardian
-from hapticbridge.guard import Limits
+from hapticbridge.demand.guard import Limits
 
 node = os.open(sys.argv[2], os.O_WRONLY)
 is_stuck = []

@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.guard import Limits
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
+from hapticbridge.run.bridge import Bridge
 
 PERIOD = 1e-3
 CAUSE = 1500

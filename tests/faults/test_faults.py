@@ -19,13 +19,13 @@ from faults.catalogue import FAULTS, PUSHED, PUSHER, RING_FULL, UNSEEN, Fault, p
 from faults.processes import HANGS, STOPS, Hang, hang, stop_at_start
 from faults.rig import CAUSE, PERIOD, PRESS, Rig
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
+from hapticbridge.demand.guard import USUAL_ENERGY, Limits
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import SafetyTrip
-from hapticbridge.guard import USUAL_ENERGY, Limits
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
+from hapticbridge.run.bridge import Bridge
 
 LIMIT, MAX_ENERGY = 10.0, 0.05
 """Force limit of the rig in N, and energy in J beyond what the hand put in."""

@@ -18,10 +18,10 @@ from report_runs import LOOSE
 from test_bridge_commands import FLOOR, swaying
 
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
-from hapticbridge.record import TICK_DTYPE
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.recording import read_recording
+from hapticbridge.run.bridge import Bridge
 from hapticbridge.view.window import Address, Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")

@@ -14,7 +14,6 @@ from audit_cases import tapped
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hapticbridge.commands import command_of
 from hapticbridge.confinement import unpacked
 from hapticbridge.device import DeviceInfo, spacemouse
 from hapticbridge.device.falcon.protocol import read_firmware
@@ -27,7 +26,8 @@ from hapticbridge.device.transport.hid_descriptor import fields_of
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.parameters import GuardParameters
 from hapticbridge.recording import read_recording
-from hapticbridge.request import request_of
+from hapticbridge.run.commands import command_of
+from hapticbridge.run.request import request_of
 from hapticbridge.scene import scene_parameters, settings_from
 from hapticbridge.scene.source import read_elements, refuse_outside
 from hapticbridge.view.window import Address

@@ -20,7 +20,7 @@ from hapticbridge.cli.main import main
 from hapticbridge.device import Device
 from hapticbridge.device.discovery import plugged_devices
 from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from usb_tiers import benches
 from usb_tiers.benches import usable_devices, wait_for
 from usb_tiers.conftest import FIRST_FRONT_END, IS_TIME_VIRTUAL, TIER, Plug

@@ -63,8 +63,8 @@ from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.transport.usb import UsbLink, find
 from hapticbridge.device.watchdog import SILENCE, SilenceDetector
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.jit import direct
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.jit import direct
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 # Measured timing of a Falcon
 

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.device.falcon.protocol import Request, encode
-from hapticbridge.jit import compiled
+from hapticbridge.kernel.jit import compiled
 
 THIGH, SHIN = 0.060, 0.1025
 """Lengths a and b in m: thigh, and long side of the parallelogram."""

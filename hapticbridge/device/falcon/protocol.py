@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from hapticbridge.device.driver import Notify
 from hapticbridge.device.watchdog import SILENCE
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.jit import compiled
+from hapticbridge.kernel.jit import compiled
 
 SIZE = 16
 """Bytes per packet, in each direction."""

@@ -44,7 +44,7 @@ from hapticbridge.device.transport.hid_descriptor import (
 )
 from hapticbridge.device.watchdog import ForceOffGuardian, guard_device_node
 from hapticbridge.errors import DeviceError
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 # Constant-force effects of a stick
 

@@ -46,8 +46,8 @@ from hapticbridge.device.watchdog import (
     watchdog_time,
 )
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.pose import canonical, quaternion_exp
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.pose import canonical, quaternion_exp
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 
 class FrameLink(Protocol):

@@ -40,8 +40,8 @@ from hapticbridge.device.simulated.dynamics import (
 )
 from hapticbridge.device.trajectory import Motion, read_motion
 from hapticbridge.errors import DeviceError, SceneError
-from hapticbridge.jit import direct
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.jit import direct
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.scene import custom_numbers
 from hapticbridge.theory.sampled_loop import WorstHand
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from hapticbridge.arguments import check_fields, option
 from hapticbridge.device.trajectory import lissajous, pose_at
 from hapticbridge.errors import DeviceError
-from hapticbridge.jit import compiled
-from hapticbridge.pose import (
+from hapticbridge.kernel.jit import compiled
+from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
     canonical,

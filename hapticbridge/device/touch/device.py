@@ -61,7 +61,7 @@ from hapticbridge.device.touch.servo import (
 from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.device.watchdog import SILENCE, SilenceDetector, watchdog_time
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 MEASURED = ("mass", "damping", "friction", "resolution")
 """Numbers of the data sheet that are known only from a measurement."""

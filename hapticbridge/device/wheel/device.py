@@ -73,8 +73,8 @@ from hapticbridge.device.wheel.evdev import (
     range_of,
 )
 from hapticbridge.errors import DeviceError, DeviceLost, choices
-from hapticbridge.pose import canonical, quaternion_exp
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.pose import canonical, quaternion_exp
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 
 RESTART, LIFE = 0.02, 0.1
 """Time in s between restarts of the effect, and its duration. Five restarts in a row may be lost

@@ -21,7 +21,7 @@ from hapticbridge.lab.chart.engine_run import EngineRun
 from hapticbridge.lab.chart.setting import OWN, Setting, simulator_name
 from hapticbridge.lab.chart.workload import PASSIVE, Panel, PeerWork, Run, Score, Workload
 from hapticbridge.lab.engines.base import Engine, open_engine
-from hapticbridge.run_description import processor
+from hapticbridge.run.description import processor
 
 # Workloads by name
 

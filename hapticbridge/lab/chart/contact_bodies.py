@@ -18,6 +18,8 @@ from hapticbridge.check.perception import WEBER
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import StudyError
+from hapticbridge.kernel.pose import quaternion_exp
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import motion_along
 from hapticbridge.lab.chart.free_bodies import still
 from hapticbridge.lab.chart.scene_run import Stage, Staged, Stages
@@ -32,8 +34,6 @@ from hapticbridge.lab.chart.workload import (
 )
 from hapticbridge.lab.engines.base import Body, Pose, Shape, Task, Velocity
 from hapticbridge.lab.maps.base import scene_of
-from hapticbridge.pose import quaternion_exp
-from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.theory.impact import Impact, ImpactBody, resolve_impact
 

@@ -13,6 +13,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, StudyError
 from hapticbridge.kernel.ledger import ENERGY_TOLERANCE
+from hapticbridge.kernel.pose import conjugate, dot, rotated, rotation_between, subtract
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.scene_run import Path
 from hapticbridge.lab.chart.setting import Setting
 from hapticbridge.lab.chart.workload import Judge, PeerWork, Reading, Score, Take, Verdict
@@ -27,8 +29,6 @@ from hapticbridge.lab.engines.base import (
 )
 from hapticbridge.lab.engines.from_scene import task_from_scene
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.pose import conjugate, dot, rotated, rotation_between, subtract
-from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import Scene
 
 HELD = METHODS["explicit"]

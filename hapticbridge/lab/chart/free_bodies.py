@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.check.perception import FORCE_FLOOR, LEVER, tool_angles
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import work_of
 from hapticbridge.lab.chart.scene_run import Stage, Staged, Stages
 from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
 from hapticbridge.lab.engines.base import Velocity
 from hapticbridge.lab.maps.base import free_body, scene_of
-from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.theory.rigid_body import exact_mass_response, integrate_rotation
 

@@ -24,9 +24,9 @@ from hapticbridge.files import finite_or_null, prepared_folder
 from hapticbridge.lab.chart.chart import Chart, Measurement, Order
 from hapticbridge.lab.chart.setting import OWN, Setting, simulator_name
 from hapticbridge.lab.chart.workload import PASSIVE, Panel, Verdict
-from hapticbridge.options import DEFAULT_OPTIONS
 from hapticbridge.plotting import new_figure, write_picture
-from hapticbridge.run_description import versions
+from hapticbridge.run.description import versions
+from hapticbridge.run.options import DEFAULT_OPTIONS
 
 RATE = 1000.0
 """Rate of the loop in Hz that a recommendation is for: that of most devices."""

@@ -16,6 +16,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.device.trajectory import read_motion
 from hapticbridge.errors import StudyError
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import EngineRun, work_of
 from hapticbridge.lab.chart.scene_run import (
     REFERENCE_REFINEMENT,
@@ -37,7 +38,6 @@ from hapticbridge.lab.chart.workload import (
 )
 from hapticbridge.lab.engines.base import open_engine
 from hapticbridge.lab.maps.contact_rigs import ROTATION
-from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import Scene, load_scene, scene_path
 
 HOME = np.array([0.0, 0.0, 0.04])

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
+from hapticbridge.kernel.pose import quaternion_exp
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import work_of
 from hapticbridge.lab.chart.peg import HOLD, RAMP, led, score_at_rest
 from hapticbridge.lab.chart.scene_run import Stage, Staged, Stages
 from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
 from hapticbridge.lab.maps.base import scene_of
-from hapticbridge.options import Workspace
-from hapticbridge.pose import quaternion_exp
-from hapticbridge.record import TICK_DTYPE
+from hapticbridge.run.options import Workspace
 from hapticbridge.scene import Scene
 
 GRAVITY = 9.81

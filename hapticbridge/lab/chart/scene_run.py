@@ -15,11 +15,19 @@ from numpy.typing import NDArray
 from hapticbridge.check.case import motion_for
 from hapticbridge.check.perception import felt_error
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import (
+    IMPLICIT,
+    LOSSLESS_COUPLING,
+    Method,
+    prepare,
+    resolve_contact_stiffness,
+)
 from hapticbridge.device import Motion
 from hapticbridge.device.trajectory import pose_at
 from hapticbridge.errors import HapticBridgeError, StudyError
 from hapticbridge.kernel.mujoco_c import without_timers
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
 from hapticbridge.lab.chart.setting import (
@@ -43,24 +51,16 @@ from hapticbridge.lab.chart.workload import (
     score_of,
 )
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.options import (
+from hapticbridge.run.options import (
     PRESCRIBED_MOTION,
     SAME_FRAME,
     RunSetup,
     Workspace,
     steady_stiffness,
 )
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.rendering import (
-    IMPLICIT,
-    LOSSLESS_COUPLING,
-    Method,
-    prepare,
-    resolve_contact_stiffness,
-)
+from hapticbridge.run.slow_scene import SlowScene
+from hapticbridge.run.summary import Ledger
 from hapticbridge.scene import Scene, load_scene
-from hapticbridge.slow_scene import SlowScene
-from hapticbridge.summary import Ledger
 
 Runner = Callable[[NDArray[np.void], NDArray[np.void]], int]
 """Function that runs one tick per sample, writes the records, and returns the completed ticks."""

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.demand.methods import Method, method_named
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.rendering import Method, method_named
 from hapticbridge.scene import Scene
 
 OWN = "hapticbridge"

@@ -20,7 +20,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion, pose_at
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.files import install_command
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
     add,

@@ -14,9 +14,9 @@ from typing import Any
 import pybullet
 
 from hapticbridge.errors import StudyError
+from hapticbridge.kernel.pose import Quaternion, Vector
 from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.from_scene import HeldSimulation
-from hapticbridge.pose import Quaternion, Vector
 
 SLOP = 1e-7
 """Depth in m that a contact keeps under sequential impulses. A settled tool is wrong by Bullet's

@@ -30,9 +30,9 @@ from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+from hapticbridge.kernel.pose import Vector
 from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.from_scene import HeldSimulation
-from hapticbridge.pose import Vector
 
 POINT_STIFFNESS = 1e7
 """Stiffness of a point contact in N/m. The remaining error stems from Drake's single point for two

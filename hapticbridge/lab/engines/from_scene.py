@@ -12,10 +12,9 @@ from hapticbridge.arguments import Array
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, held_body
-from hapticbridge.lab.engines import base
-from hapticbridge.pose import (
+from hapticbridge.kernel.jit import compiled
+from hapticbridge.kernel.pose import (
     ZERO_VECTOR,
     Quaternion,
     Vector,
@@ -28,6 +27,7 @@ from hapticbridge.pose import (
     scaled,
     subtract,
 )
+from hapticbridge.lab.engines import base
 from hapticbridge.scene import Scene
 
 _KINDS: dict[int, base.Kind] = {

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 
 import mujoco
 
+from hapticbridge.kernel.pose import Vector, add, conjugate, cross, rotated, subtract
 from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.from_scene import HeldSimulation
-from hapticbridge.pose import Vector, add, conjugate, cross, rotated, subtract
 
 _MODELING = "MuJoCo documentation, Modeling: Solver parameters"
 _OVERVIEW = "MuJoCo documentation, Computation: Numerical integration"

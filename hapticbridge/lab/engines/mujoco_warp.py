@@ -18,9 +18,9 @@ import numpy as np
 import warp
 from numpy.typing import NDArray
 
+from hapticbridge.kernel.pose import Vector
 from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.mujoco import TOOL, MujocoEngine, MujocoSimulation
-from hapticbridge.pose import Vector
 
 MAX_CONTACTS, MAX_ROWS = 200, 1000
 """Contacts and rows of constraints that a scene may have; the library drops those beyond."""

@@ -18,9 +18,9 @@ import numpy as np
 import warp
 from scipy.spatial import ConvexHull
 
+from hapticbridge.kernel.pose import Vector
 from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.from_scene import HeldSimulation
-from hapticbridge.pose import Vector
 
 GAP = 1e-3
 """Distance in m at which contacts are made. It covers the motion of some steps and is small against

@@ -20,11 +20,9 @@ from numpy.typing import NDArray
 
 from hapticbridge.arguments import Array
 from hapticbridge.errors import StudyError
-from hapticbridge.jit import compiled, direct
+from hapticbridge.kernel.jit import compiled, direct
 from hapticbridge.kernel.mujoco_c import floats
-from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import Frame, HeldSimulation
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     ZERO_VECTOR,
     Quaternion,
     Vector,
@@ -33,6 +31,8 @@ from hapticbridge.pose import (
     scaled,
     subtract,
 )
+from hapticbridge.lab.engines import base
+from hapticbridge.lab.engines.from_scene import Frame, HeldSimulation
 
 _NAMES = ("libode.so.8", "libode.so.6", "libode.so", "libode.dylib")
 

@@ -15,9 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import Frame, HeldSimulation
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     ZERO_VECTOR,
     Quaternion,
     Vector,
@@ -26,6 +24,8 @@ from hapticbridge.pose import (
     scaled,
     subtract,
 )
+from hapticbridge.lab.engines import base
+from hapticbridge.lab.engines.from_scene import Frame, HeldSimulation
 
 with warnings.catch_warnings():
     # that no graphics card was found, which nothing here draws on

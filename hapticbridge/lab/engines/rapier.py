@@ -12,9 +12,9 @@ from typing import Any
 
 import rapier3d
 
+from hapticbridge.kernel.pose import Vector
 from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.from_scene import HeldSimulation
-from hapticbridge.pose import Vector
 
 LENGTH = 1e-3
 """``length_unit`` in m, of which the allowed depth and the distance of prediction are shares. The

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import UNLIMITED
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.device.simulated.device import scene_hand
 from hapticbridge.device.trajectory import read_motion
-from hapticbridge.guard import UNLIMITED
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.methods import METHODS

@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import UNLIMITED
 from hapticbridge.device import Motion, SimulatedDevice
-from hapticbridge.guard import UNLIMITED
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences

@@ -15,20 +15,20 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import prepare
 from hapticbridge.device import Motion, TrajectoryDevice
+from hapticbridge.kernel.pose import IDENTITY_POSE
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.options import RunSetup
 from hapticbridge.plotting import new_figure
-from hapticbridge.pose import IDENTITY_POSE
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.rendering import prepare
+from hapticbridge.run.options import RunSetup
+from hapticbridge.run.summary import Ledger
 from hapticbridge.scene import Scene
-from hapticbridge.summary import Ledger
 from hapticbridge.sweep import Table
 
 INERTIA = np.array([1.5e-3, 3.63e-3, 4.53e-3])
@@ -152,7 +152,7 @@ def spin(
     """Turns the handle at a constant speed for 1 s, with the tool behind it.
 
     Args:
-        method: One of ``rendering.METHODS`` that has a coupling.
+        method: One of ``methods.METHODS`` that has a coupling.
         coupling: K and B.
         speed: Speed of the handle in rad/s.
         angle: Lead of the handle over the tool at the start, about x, in rad.

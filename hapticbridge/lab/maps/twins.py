@@ -11,16 +11,16 @@ from signal import Signals
 from typing import Any
 
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import UNLIMITED
 from hapticbridge.device import Device
 from hapticbridge.files import atomic_write
-from hapticbridge.guard import UNLIMITED
-from hapticbridge.options import BridgeOptions
 from hapticbridge.recording import read_recording
 from hapticbridge.report.cause import excess_of
 from hapticbridge.report.evidence import Evidence
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.options import BridgeOptions
 from hapticbridge.scene import Scene
 from hapticbridge.signals import StopSignal
 from hapticbridge.units import format_energy

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import IMPLICIT, prepare
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
-from hapticbridge.options import RunSetup
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.rendering import IMPLICIT, prepare
+from hapticbridge.run.options import RunSetup
 from hapticbridge.scene import load_scene
 from hapticbridge.theory.sampled_loop import WorstHand, threshold
 

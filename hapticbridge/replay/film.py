@@ -21,17 +21,17 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from hapticbridge import jit
 from hapticbridge.arguments import check_fields, option
+from hapticbridge.audit.recorded_scene import load_machine_code, machine_code_for, seconds_for
 from hapticbridge.confinement import MEMORY, Confined, ForeignSceneError, Fresh, Work, Worker
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import install_command
-from hapticbridge.film_process import Camera, Frame, Stage, film_ticks, write_film
+from hapticbridge.kernel import jit
 from hapticbridge.kernel.codes import added_actuators
-from hapticbridge.record import TICK_DTYPE, Timeline
-from hapticbridge.recorded_scene import load_machine_code, machine_code_for, seconds_for
+from hapticbridge.kernel.record import TICK_DTYPE, Timeline
 from hapticbridge.recording import RecordingFile, open_recording
-from hapticbridge.run_description import parameters_of
+from hapticbridge.replay.stage import Camera, Frame, Stage, film_ticks, write_film
+from hapticbridge.run.description import parameters_of
 
 RENDERERS = ("egl", "osmesa")
 """Renderers without a display: EGL with a graphics card or Mesa, OSMesa on the processor alone."""

@@ -19,10 +19,11 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.certificate import condition_sentences
 from hapticbridge.clock import Clock, RealClock
-from hapticbridge.commands import Command, Repeat, Stop
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import condition_sentences
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.trip import Trip, TripCode
 from hapticbridge.device import Device
 from hapticbridge.device.base import checked_read, checked_write
 from hapticbridge.errors import (
@@ -32,31 +33,31 @@ from hapticbridge.errors import (
     SceneError,
     choices,
 )
-from hapticbridge.guard import Limits, is_unsound, trip_reason
-from hapticbridge.hands import (
+from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, HAND_CODES, OK, RING_FULL
+from hapticbridge.kernel.mujoco_c import quiet, without_timers
+from hapticbridge.realtime import real_time
+from hapticbridge.recording.recorder import RingObserver
+from hapticbridge.run.commands import Command, Repeat, Stop
+from hapticbridge.run.hands import (
     DeviceGroup,
     Grasp,
     devices_for_run,
     scene_of_grasps,
 )
-from hapticbridge.inputs import Write, input_writes
-from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, HAND_CODES, OK, RING_FULL
-from hapticbridge.kernel.mujoco_c import quiet, without_timers
-from hapticbridge.options import (
+from hapticbridge.run.options import (
     DEFAULT_OPTIONS,
     BridgeOptions,
     RunSetup,
     Workspace,
     device_for_run,
 )
-from hapticbridge.realtime import real_time
-from hapticbridge.recording.recorder import RingObserver
-from hapticbridge.request import RunRequest
+from hapticbridge.run.request import RunRequest
+from hapticbridge.run.session import RecordOutput, Session, StopRequest
+from hapticbridge.run.summary import Ledger, Summary
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.compile import clause
-from hapticbridge.session import RecordOutput, Session, StopRequest
+from hapticbridge.scene.inputs import Write, input_writes
 from hapticbridge.signals import stopping_on_signals
-from hapticbridge.summary import Ledger, Summary
 
 OnTick = Callable[[int], None]
 """Function called with a tick's number before the tick, for scripted inputs."""
@@ -227,7 +228,7 @@ class Bridge:
                 first, where it still could be.
             HapticBridgeError: The bridge is not open, or the duration is out of range.
         """
-        session, reason = self._open_session(), ""
+        session, trip = self._open_session(), None
         session.begin(duration)
         with ExitStack() as stack:
             stack.callback(session.note_stop)
@@ -238,23 +239,22 @@ class Bridge:
                 session.note_grants(stack.enter_context(real_time()))
             try:
                 session.start_clock()
-                reason = self._loop(session, on_tick)
+                trip = self._loop(session, on_tick)
             except DeviceError as error:
-                reason = f"tick {session.tick}: {error}"
+                trip = Trip(TripCode.DEVICE, session.tick, detail=str(error))
             except mujoco.FatalError as error:
-                reason = f"tick {session.tick}: MuJoCo stopped: {clause(error)}"
-                session.is_unsound = True
+                trip = Trip(TripCode.SIMULATION, session.tick, detail=clause(error))
             finally:
                 unsent = session.command_zero_force()
-        if reason or unsent:
-            raise session.trip(reason or unsent)
+        if found := trip or unsent:
+            raise session.trip(found)
         session.stopped_by = session.stopped_by or "duration"
         return session.summary()
 
     def _loop(  # noqa: PLR0912 - one loop
         self, session: Session, on_tick: OnTick | None
-    ) -> str:
-        """Runs the ticks until the end; returns the reason of a trip, or an empty text."""
+    ) -> Trip | None:
+        """Runs the ticks until the end; returns a trip, or None."""
         kernel, model, data = session.kernel, self.scene.model, self.scene.data
         wait, now, stops = self.clock.wait, self.clock.now, self._stop.waiting
         read_device, write_device = checked_read(self.device), checked_write(self.device)
@@ -281,10 +281,10 @@ class Bridge:
                 elif code == HALF_DONE:
                     second_half(model, data)
                 else:
-                    return self._reason_with_hand(code, session.tick)
+                    return self._trip(code, session.tick)
                 code = answer(state, row, substep)
             if code != OK:
-                return self._reason_with_hand(code, session.tick)
+                return self._trip(code, session.tick)
             write_device(wrench)
             write = now()
             if mark is not None:
@@ -299,16 +299,15 @@ class Bridge:
             while code == RING_FULL and stream.makes_room(is_stopping=bool(stops)):
                 code = kernel.publish_again(deadline, wake, read, write, flags)
             if code == BAD_RESULT:
-                return self._reason_with_hand(code, session.tick)
+                return self._trip(code, session.tick)
             session.tick += 1
-        return ""
+        return None
 
-    def _reason_with_hand(self, code: int, tick: int) -> str:
-        """Describes why the kernel refused a tick, and for which of several hands."""
+    def _trip(self, code: int, tick: int) -> Trip:
+        """Returns why the kernel refused a tick, and for which of several hands."""
         hand, code = divmod(code, HAND_CODES)
         grip = self.setups[hand].scene.grip if self.setup.scene.has_several_hands else ""
-        self.session.is_unsound = is_unsound(code)
-        return trip_reason(code, tick, grip)
+        return Trip.of_result(code, tick, grip)
 
     def stop(self, by: str = "caller") -> None:
         """Ends the run after the present tick; callable from ``on_tick`` and from any thread.

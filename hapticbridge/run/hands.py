@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from hapticbridge.arguments import check_fields, option, rule, shared
 from hapticbridge.clock import Clock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.methods import METHODS, method_named
 from hapticbridge.device import Device, DeviceInfo
 from hapticbridge.device.base import checked_close, checked_read, checked_start, checked_write
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
-from hapticbridge.guard import Limits
 from hapticbridge.kernel.codes import Grip
-from hapticbridge.options import AUTO, BridgeOptions, RunSetup, Workspace, device_for_run
 from hapticbridge.recording.format import MAX_HANDS
-from hapticbridge.rendering import METHODS, method_named
+from hapticbridge.run.options import AUTO, BridgeOptions, RunSetup, Workspace, device_for_run
 from hapticbridge.scene import Scene, load_scene
 
 

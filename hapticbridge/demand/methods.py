@@ -37,7 +37,7 @@ from hapticbridge.kernel.codes import (
 from hapticbridge.kernel.law import GainRule, implicit_gains
 from hapticbridge.kernel.lossless import REACH
 from hapticbridge.kernel.parameters import SLOW_SCHEMES, RunParameters, checked_substeps
-from hapticbridge.pose import IDENTITY_POSE
+from hapticbridge.kernel.pose import IDENTITY_POSE
 from hapticbridge.scene import Scene
 from hapticbridge.scene.checks import check_metered, refuse_overlap
 from hapticbridge.scene.contacts import warn_of_contacts

@@ -9,11 +9,7 @@ from functools import partial
 from typing import Literal
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device.base import DeviceInfo
-from hapticbridge.errors import CouplingError
-from hapticbridge.kernel.codes import Scheme
-from hapticbridge.kernel.parameters import RunParameters, checked_substeps
-from hapticbridge.loop_setting import (
+from hapticbridge.demand.loop_setting import (
     IN_TIME,
     Axis,
     Lag,
@@ -22,7 +18,11 @@ from hapticbridge.loop_setting import (
     device_period,
     required_damping,
 )
-from hapticbridge.rendering import Method, default_method
+from hapticbridge.demand.methods import Method, default_method
+from hapticbridge.device.base import DeviceInfo
+from hapticbridge.errors import CouplingError
+from hapticbridge.kernel.codes import Scheme
+from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.theory.bounds import (
     NEEDED_SHARE,
     midpoint_damping,
@@ -71,7 +71,8 @@ def default_coupling(
     uses B' without clipping. It needs 85 % of b. Behind a device that is late the ratio B'/K is the
     one with the largest K (``theory.bounds.stiffest_late_coupling``). If several evaluations per
     tick need more, or friction does not hold the encoder's steps, K and B' are lowered together;
-    both conditions are linear in both.
+    both conditions are linear in both. Without any friction no coupling is free of swings by steps,
+    so damping alone decides, and the condition says so.
 
     Args:
         info: The device; unknown damping is replaced as in ``assumed_damping``.
@@ -79,7 +80,7 @@ def default_coupling(
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
         law_evaluations: Evaluations of the wrench per tick (substeps).
-        method: Rendering method; None takes ``rendering.default_method``.
+        method: Rendering method; None takes ``methods.default_method``.
 
     Raises:
         CouplingError: The number of evaluations, a scale or the period is out of range.
@@ -195,10 +196,6 @@ class StepCondition:
         return text if self.holds else f"{text}; {self.remedy}"
 
 
-UNPROVED = "no proof is built in yet"
-"""Words for a verdict that is left open: of a device that answers late."""
-
-
 @dataclass(frozen=True, slots=True)
 class DampingCondition:
     """The device condition on one kind of axis: b >= scale · force_scale · (K T/2 + B'), in time.
@@ -245,6 +242,18 @@ class DampingCondition:
         left = 1.0 - self.needed / self.available if self.available else -math.inf
         return left if self.steps is None else min(left, self.steps.margin)
 
+    @property
+    def unit(self) -> str:
+        """Unit of the damping."""
+        return "N m s/rad" if self.axis == "rotation" else "N s/m"
+
+    def lack(self, bound: str) -> str:
+        """Returns a clause on what is missing; ``bound`` names the damping that is needed."""
+        if self.is_damped:
+            return "friction < K Δ/2 + B_law Δ/T, so encoder steps shake it"
+        where = " in rotation" if self.axis == "rotation" else ""
+        return f"b < {bound}{where}: {self.available or 0.0:.4g} < {self.needed:.4g} {self.unit}"
+
     def sentence(self) -> str:
         """Describes the condition, with the remedy if it fails."""
         if not self.is_felt:
@@ -252,7 +261,7 @@ class DampingCondition:
                 f"{self.axis}: sensed without a motor, so the hand may get back along the other "
                 "axes what it put in there without effort; only --energy-limit bounds it"
             )
-        unit = "N s/m" if self.axis == "translation" else "N m s/rad"
+        unit = self.unit
         if self.available is None:
             return (
                 f"{self.axis}: device damping unknown, {self.needed:g} {unit} needed; "
@@ -269,7 +278,7 @@ class DampingCondition:
         elif self.delay:
             late = format_si(self.delay * self.tick, "s")
             ticks = "1 tick" if self.delay == 1 else f"{self.delay} ticks"
-            text = f"{text} with its delay of {late} ({ticks}), for which {UNPROVED}"
+            text = f"{text} with its delay of {late} ({ticks}), for which no proof is built in yet"
         return text if self.steps is None else f"{text}; {self.steps.sentence()}"
 
 

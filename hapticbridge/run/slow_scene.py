@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import BAD_RESULT, OK
+from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.shown_tool import fail_scene
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import (
@@ -35,7 +36,6 @@ from hapticbridge.kernel.tick import (
     simulate_shown,
     take_result,
 )
-from hapticbridge.record import SAMPLE_DTYPE
 
 LONGEST_WAIT = 2.0
 """Time in s that the end of a run waits for a step of the scene, and after which a result that is

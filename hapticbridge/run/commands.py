@@ -20,9 +20,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.arguments import check_fields, rule_of, shared, shown
-from hapticbridge.certificate import StepCondition, assumed_damping
+from hapticbridge.arguments import LARGEST, SMALLEST, check_fields, rule_of, shared, shown
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import StepCondition, assumed_damping
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.loop_setting import IN_TIME, LoopSetting
+from hapticbridge.demand.methods import Method
 from hapticbridge.errors import (
     CommandError,
     CouplingError,
@@ -31,15 +34,13 @@ from hapticbridge.errors import (
     choices,
 )
 from hapticbridge.files import read_json
-from hapticbridge.guard import Limits
-from hapticbridge.inputs import applied_writes
 from hapticbridge.kernel.codes import CLUTCHED, FORCE_OFF
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
-from hapticbridge.loop_setting import IN_TIME, LoopSetting
-from hapticbridge.rendering import Method
-from hapticbridge.run_description import restore_state
-from hapticbridge.slow_scene import SlowScene
+from hapticbridge.run.description import restore_state
+from hapticbridge.run.slow_scene import SlowScene
+from hapticbridge.scene.inputs import applied_writes
+from hapticbridge.units import format_si
 
 # Commands and their wire format
 
@@ -63,10 +64,12 @@ class Couple:
         CommandError: A value is out of range.
     """
 
-    stiffness: float = shared(Coupling, "stiffness")
-    damping: float = shared(Coupling, "damping")
-    rotational_stiffness: float | None = shared(Coupling, "rotational_stiffness", None)
-    rotational_damping: float | None = shared(Coupling, "rotational_damping", None)
+    stiffness: float = shared(Coupling, "stiffness", least=SMALLEST, most=LARGEST)
+    damping: float = shared(Coupling, "damping", most=LARGEST)
+    rotational_stiffness: float | None = shared(
+        Coupling, "rotational_stiffness", None, most=LARGEST
+    )
+    rotational_damping: float | None = shared(Coupling, "rotational_damping", None, most=LARGEST)
     grip: str | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -201,7 +204,9 @@ class AxisCouplingLimits:
 
     They follow from the device condition b >= s (K T/2 + B'), with s = s_h s_f for translation and
     s_f/s_h for rotation. B' is the damping of the law. With a delay or several laws per tick the
-    requirement is larger and has no closed form (``loop_setting.required_damping``).
+    requirement is larger and has no closed form (``loop_setting.required_damping``). In translation
+    the friction that the encoder's steps need is a limit too (``certificate.StepCondition``).
+    Without any friction none suffices; then no coupling may shake the hand more than the start's.
 
     Attributes:
         axis: ``translation`` or ``rotation``.
@@ -254,24 +259,34 @@ class AxisCouplingLimits:
         for ratio in ratios.tolist():
             at = replace(loop, law=self.put(self.run.start, 1.0, ratio))
             try:
-                needs.append(max(at.needs()[self.axis == "rotation"], self._for_steps(at)))
+                needs.append(at.needs()[self.axis == "rotation"])
             except CouplingError:  # the delay is beyond what the theory takes
                 needs.append(math.inf)
         return ratios, np.array(needs)
 
-    def _for_steps(self, loop: LoopSetting) -> float:
-        """Returns the damping b times the share of the friction that encoder steps need."""
-        steps = StepCondition.of(loop)
-        if self.axis == "rotation" or steps is None or not steps.available:
-            return 0.0
-        return self.damping * (steps.needed or 0.0) / steps.available
+    def steps(self, requested: Coupling) -> StepCondition | None:
+        """Returns the condition on encoder steps of a requested coupling; None without a limit."""
+        if self.axis == "rotation":
+            return None
+        found = StepCondition.of(replace(self.run.loop, law=self.run.law(requested)))
+        return None if found is None or found.holds is None else found
+
+    @cached_property
+    def friction(self) -> float:
+        """Friction in N that holds encoder steps; without any, what the start's coupling needs."""
+        found = self.steps(self.run.start)
+        return math.inf if found is None else found.available or found.needed or 0.0
 
     def needed(self, stiffness: float, damping: float) -> float:
         """Returns the device damping b in N s/m or N m s/rad that requested gains need.
 
-        It takes microseconds after the first call, because a refusal must not slow the loop.
+        It is inf where friction does not hold the encoder's steps. It takes microseconds after the
+        first call, because a refusal must not slow the loop.
         """
         requested = self.put(self.run.start, stiffness, damping)
+        steps = self.steps(requested)
+        if steps is not None and (steps.needed or 0.0) > self.friction * (1.0 + 1e-9):
+            return math.inf
         stiffness, damping = self.gains(self.run.law(requested))
         ratios, needs = self._table
         highest = float(ratios[-1])
@@ -321,6 +336,14 @@ class AxisCouplingLimits:
                 "longer feels where the tool is, or the run stops before the force is full"
             )
         needed = self.needed(stiffness, damping)
+        steps = self.steps(self.put(self.run.start, stiffness, damping))
+        if steps is not None and needed == math.inf:
+            has = f"{steps.available:.3g} N" if steps.available else "none"
+            raise CommandError(
+                f"stiffness {stiffness:g} {unit} with damping {damping:g} {damper} needs "
+                f"{steps.needed:.3g} N of friction for the encoder's steps of "
+                f"{format_si(steps.resolution or 0.0, 'm')}; the device has {has}"
+            )
         if not needed <= self.damping * (1.0 + 1e-9):
             raise CommandError(
                 f"{prefix}stiffness {stiffness:g} {unit} with {prefix}damping {damping:g} {damper} "
@@ -393,9 +416,19 @@ class CouplingLimits:
         dampings = " and ".join(f"{span.damping:.3g} {UNITS[span.axis][1]}" for span in self.spans)
         if info.is_prescribed:
             return f"They end where a device with a damping of {dampings} would just suffice."
+        steps = self.translation.steps(self.start)
+        of_steps = ""
+        if steps is not None:
+            step = format_si(steps.resolution or 0.0, "m")
+            of_steps = (
+                f", or its friction of {format_si(steps.available, 'N')} for its steps of {step}"
+                if steps.available
+                else f", and where its steps of {step} would shake it more than at the start: "
+                "without friction they shake any coupling"
+            )
         return (
-            f"They end where the device's damping of {dampings}{known} just suffices. Beyond, the "
-            "coupling could push the hand by itself."
+            f"They end where the device's damping of {dampings}{known} just suffices{of_steps}. "
+            "Beyond, the coupling could push the hand by itself."
         )
 
     def check(self, command: Couple) -> None:
@@ -482,7 +515,7 @@ class EventApplier:
 
     The loop applies the event that it records, so live run and re-simulation share one path.
     ``hands`` holds kernel and parameters of each hand. ``start`` is the scene's state at the start
-    (``run_description.start_state``), as bytes. A scene slower than the loop takes part in a change
+    (``description.start_state``), as bytes. A scene slower than the loop takes part in a change
     before its next step.
     """
 

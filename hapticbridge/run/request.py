@@ -18,17 +18,17 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.dataclass_json import from_json, to_json
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.hands import Grasp, resolve_hands
 from hapticbridge.kernel.codes import Grip
 from hapticbridge.kernel.parameters import UNGUARDED, RunParameters
-from hapticbridge.options import AUTO, DEFAULT_OPTIONS, BridgeOptions, RunSetup
-from hapticbridge.pose import IDENTITY_POSE
-from hapticbridge.run_description import (
+from hapticbridge.kernel.pose import IDENTITY_POSE
+from hapticbridge.run.description import (
     describe_parameters,
     metas_of,
     parameters_of,
     requested_of,
 )
+from hapticbridge.run.hands import Grasp, resolve_hands
+from hapticbridge.run.options import AUTO, DEFAULT_OPTIONS, BridgeOptions, RunSetup
 from hapticbridge.scene import Scene
 
 

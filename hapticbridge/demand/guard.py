@@ -1,4 +1,4 @@
-"""Guard of a run: limits, parameters for a device, checks before force, reasons of a trip."""
+"""Guard of a run: limits, parameters for a device, checks before force."""
 
 from __future__ import annotations
 
@@ -11,28 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.arguments import check_fields, option, unit_of
-from hapticbridge.certificate import assumed_damping
 from hapticbridge.clock import Clock, RealClock, SimulatedClock
+from hapticbridge.demand.certificate import assumed_damping
+from hapticbridge.demand.loop_setting import IN_TIME, Lag
 from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.device.base import JUMP_MARGIN
 from hapticbridge.device.registry import is_driver
 from hapticbridge.errors import DeviceError
-from hapticbridge.jit import direct
-from hapticbridge.kernel.codes import (
-    BACKWARDS,
-    BAD_SAMPLE,
-    GAVE_ENERGY,
-    JUMPED,
-    STRETCHED,
-    TWISTED,
-    WARNING_REMEDIES,
-    WARNINGS,
-)
 from hapticbridge.kernel.handle import stretch_at
+from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, OFF, GuardParameters
 from hapticbridge.kernel.tick_guard import FARTHEST
-from hapticbridge.loop_setting import IN_TIME, Lag
-from hapticbridge.units import format_energy
 
 # Limits of the wrench and of the run
 
@@ -273,115 +262,13 @@ def refuse_stretched_start(
     distance = direct(stretch_at, state[0], sample)(state[0], sample)
     force = float(state["coupling"]["stiffness"][0]) * distance
     if force > limits.force:
+        hand = f"hand at '{grip}': " if grip else ""
         raise DeviceError(
-            f"{_hand_at(grip)}the device's absolute pose puts the handle "
+            f"{hand}the device's absolute pose puts the handle "
             f"{1e3 * distance:.3g} mm from the grip, "
             f"{force:.3g} N at the start; the limit is {limits.force:g} N: start nearer to "
             f"{np.round(pose['tool_position'], 4).tolist()} m or use relative poses"
         )
-
-
-# Reasons of a guard's stop, in words
-
-_REASONS = {
-    BAD_SAMPLE: "the device's pose is not finite or not a rotation",
-    JUMPED: "the device's pose jumped farther than the device can move",
-    BACKWARDS: "time ran backwards",
-    STRETCHED: "the tool is farther from the handle than the stretch limit",
-    TWISTED: "the tool is turned from the handle by more than the angle limit",
-    GAVE_ENERGY: "the hand would get more than it put in, by more than the energy limit",
-} | WARNINGS
-_REMEDIES = {
-    BAD_SAMPLE: "its last sample holds NaN or infinity, or a quaternion (w, x, y, z) whose length "
-    "is not 1; check the driver's read()",
-    JUMPED: "check the unit (m) and the times (s) of what it reports, and that no sample is late",
-    STRETCHED: "check the motion's unit (m) and speed, and the tool's mass (--no-tool-weight "
-    "carries a tool that falls or tips over); with another reach in mind raise --stretch-limit",
-    TWISTED: "turn more slowly, or raise --rotational-stiffness if the device bears it",
-    GAVE_ENERGY: "lower --stiffness",
-} | WARNING_REMEDIES
-_LIMIT_MOTORS = (
-    "the scene's motors did {} of work until then{}: limit their force (forcerange), or start a "
-    "motor at ctrl 0 and a servo at its target (keyframe 'home'); 'hapticbridge check SCENE' names "
-    "those that push at the start; if they are meant to push the hand, --energy-limit is what it "
-    "may get"
-)
-_LIMIT_INPUTS = (
-    "the scene's inputs (applied forces, moved mocap bodies, gravity compensation) did {} of work "
-    "until then: make them smaller or slower; if they are meant to push the hand, --energy-limit "
-    "is what it may get"
-)
-_FIND_PUMP = (
-    "the scene itself created {} until then: 'hapticbridge check SCENE' looks for what pumps, and "
-    "'hapticbridge audit RECORDING' names the likely cause"
-)
-_DIVERGED = (
-    "the simulation is no longer finite (force, pose or energy); the scene diverged, so lower the "
-    "stiffness or the period, or see with 'hapticbridge check SCENE' what pumps"
-)
-
-
-def trip_reason(code: int, tick: int, grip: str = "") -> str:
-    """Describes why the kernel refused a tick.
-
-    ``code`` is a result of a function of ``kernel.tick``, not ``OK``; ``grip`` names the hand of
-    several that it is about.
-    """
-    hand = "" if code in WARNINGS else _hand_at(grip)
-    return f"tick {tick}: {hand}{_REASONS.get(code, _DIVERGED)}"
-
-
-def is_unsound(code: int) -> bool:
-    """Returns True for a trip after which the simulation itself is in doubt.
-
-    MuJoCo dropped contacts or constraints, or its numbers were bad. Such a run is never passive.
-    """
-    return code in WARNINGS or code not in _REASONS
-
-
-def _hand_at(grip: str) -> str:
-    return f"hand at '{grip}': " if grip else ""
-
-
-def trip_remedy(
-    reason: str,
-    motor_work: float,
-    created: float = 0.0,
-    strongest: str = "",
-    input_work: float = 0.0,
-) -> str:
-    """Returns the remedy for a trip, for the message to the user; empty if none is known.
-
-    Exception and recording keep the bare reason, because it is compared when the run is repeated.
-
-    Args:
-        reason: Result of ``trip_reason``, or a sentence that ends with it.
-        motor_work: Work of the scene's own motors until then in J, which may be the cause.
-        created: Energy in J that the scene had created until then, which may be the cause.
-        strongest: Name of the actuator that pushes most, or empty.
-        input_work: Work of the scene's inputs until then in J, which may be the cause.
-    """
-    for code, remedy in _REMEDIES.items():
-        if reason.endswith(_REASONS[code]):
-            if code == GAVE_ENERGY and created > USUAL_ENERGY:
-                return _FIND_PUMP.format(format_energy(created))
-            if code == GAVE_ENERGY and motor_work > 0.5 * USUAL_ENERGY:
-                return _LIMIT_MOTORS.format(
-                    format_energy(motor_work), f" ('{strongest}' pushes most)" * bool(strongest)
-                )
-            if code == GAVE_ENERGY and input_work > 0.5 * USUAL_ENERGY:
-                return _LIMIT_INPUTS.format(format_energy(input_work))
-            return remedy
-    return ""
-
-
-def may_be_pumped(reason: str) -> bool:
-    """Returns True for a trip that a part of the scene can cause by pushing what moves.
-
-    ``reason`` is as for ``trip_remedy``.
-    """
-    reasons = _DIVERGED, *(_REASONS[code] for code in (STRETCHED, TWISTED, GAVE_ENERGY))
-    return reason.endswith(reasons)
 
 
 CONTROLLERS = {"damper": DAMPER, "environment": ENVIRONMENT, "off": OFF}

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import finite_or_null
-from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE, Column, TickFlag, columns_of
+from hapticbridge.kernel.record import CLOCK_FIELDS, TICK_DTYPE, Column, TickFlag, columns_of
 from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
-from hapticbridge.run_description import meta_float
+from hapticbridge.run.commands import CHANGES as COMMANDED
+from hapticbridge.run.description import meta_float
 
 # Result of a comparison
 

@@ -30,10 +30,10 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.files import import_extra, reason_of
-from hapticbridge.film import Shot, states
-from hapticbridge.record import force_on_hand
+from hapticbridge.kernel.record import force_on_hand
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.ros_messages import axes_of
+from hapticbridge.replay.film import Shot, states
 
 POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")

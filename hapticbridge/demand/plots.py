@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.plotting import new_figure
-from hapticbridge.rendering import (
+from hapticbridge.demand.methods import (
     COMPENSATED,
     IMPLICIT,
     Method,
     RunCoupling,
     default_method,
 )
+from hapticbridge.plotting import new_figure
 from hapticbridge.theory.bounds import late_minimum_damping, minimum_damping, worst_frequency
 from hapticbridge.theory.spectrum import damping_spectrum
 from hapticbridge.theory.transfer import Discretization, transmission_line_spectrum

@@ -15,7 +15,7 @@ from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.codes import held_body
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.record import Timeline, force_on_hand
+from hapticbridge.kernel.record import Timeline, force_on_hand
 from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
 from hapticbridge.recording.ring import MAX_CONTACTS

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from hapticbridge.units import format_energy
@@ -85,7 +84,9 @@ class HandEnergy:
     @property
     def sentence(self) -> str:
         """Net energy and its origin, as far as it is known."""
-        text = f"{format_energy(self.net)} at most, beyond what it put in"
+        beyond = ["what it put in"]
+        if self.scene > INSTANT:
+            beyond.append(f"the {format_energy(self.scene)} that the scene released")
         works = {"motors": self.motors, "inputs": self.inputs}
         origins = [
             f"the scene's {name} did {format_energy(works[name])} of work" for name in self._pushing
@@ -95,13 +96,11 @@ class HandEnergy:
         if self.springs > INSTANT:
             springs = format_energy(self.springs)
             origins.append(f"the coupling's springs held {springs} at the start or after resets")
-        if origins:
-            return f"{text}: {'; '.join(origins)}"
-        return f"{text} and what the device's damping burned"
-
-
-def worst_of(hands: Sequence[HandEnergy]) -> HandEnergy:
-    """Returns that of the hand with the most unpaid, else of one whose certificate is limited."""
-    return max(
-        hands, key=lambda each: (each.unpaid if each.fault else 0.0, bool(each.limit), each.net)
-    )
+        if self.fault:
+            origins.append(f"nothing paid for {format_energy(self.unpaid)} of it")
+        if not origins:
+            beyond.append("what the device's damping burned")
+        *first, last = beyond
+        listed = f"{', '.join(first)} and {last}" if first else last
+        text = f"{format_energy(self.net)} at most, beyond {listed}"
+        return f"{text}: {'; '.join(origins)}" if origins else text

@@ -20,24 +20,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.clock import Clock, RealClock, slept_ns
-from hapticbridge.commands import CommandExecutor, CommandQueue, EventApplier
 from hapticbridge.coupling import Coupling
 from hapticbridge.dataclass_json import to_json
+from hapticbridge.demand.guard import (
+    refuse_implausible_pose,
+    refuse_stretched_start,
+    wait_until_still,
+)
+from hapticbridge.demand.methods import prepare, prepare_hands
+from hapticbridge.demand.trip import BY_TRIP, Trip, TripCode
 from hapticbridge.device import Device
 from hapticbridge.device.base import checked_close, checked_start, checked_write
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
-from hapticbridge.guard import (
-    may_be_pumped,
-    refuse_implausible_pose,
-    refuse_stretched_start,
-    trip_remedy,
-    wait_until_still,
-)
-from hapticbridge.hands import DeviceGroup
-from hapticbridge.inputs import Write
-from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK, RING_FULL
+from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.kernel.state import STATE_DTYPE, BoundHands, BoundKernel
 from hapticbridge.kernel.tick import (
     answer_step,
@@ -47,7 +45,6 @@ from hapticbridge.kernel.tick import (
     publish,
     publish_positions,
 )
-from hapticbridge.options import RunSetup
 from hapticbridge.realtime import (
     Grant,
     check_pace,
@@ -55,12 +52,10 @@ from hapticbridge.realtime import (
     warn_of_refusals,
     warn_of_slow_motion,
 )
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording.recorder import RecordStream, RingObserver
 from hapticbridge.recording.ring import Snapshot
-from hapticbridge.rendering import prepare, prepare_hands
-from hapticbridge.request import RunRequest
-from hapticbridge.run_description import (
+from hapticbridge.run.commands import CommandExecutor, CommandQueue, EventApplier
+from hapticbridge.run.description import (
     attachments,
     describe_hands,
     describe_machine,
@@ -68,10 +63,14 @@ from hapticbridge.run_description import (
     describe_start,
     start_state,
 )
+from hapticbridge.run.hands import DeviceGroup
+from hapticbridge.run.options import RunSetup
+from hapticbridge.run.request import RunRequest
+from hapticbridge.run.slow_scene import LONGEST_WAIT, SlowScene
+from hapticbridge.run.summary import RunOutcome, Summary
 from hapticbridge.scene.checks import first_pump, strongest_actuator
+from hapticbridge.scene.inputs import Write
 from hapticbridge.signals import deferring_stops
-from hapticbridge.slow_scene import LONGEST_WAIT, SlowScene
-from hapticbridge.summary import RunOutcome, Summary
 
 SUSPENDED_NS = 50_000_000
 """Longest sleep of the machine in ns that a run survives. After a longer one the state of hand and
@@ -272,7 +271,7 @@ class Session:
         tick: Number of the next tick.
         end: Tick before which the run ends; −1 for none.
         signal: Name of the signal that ended the last run; empty if none did.
-        is_unsound: True if a trip leaves the simulation itself in doubt (``guard.is_unsound``).
+        last_trip: Trip that ended the last run; None without one.
         is_open: False after ``close``.
 
     Raises:
@@ -296,7 +295,7 @@ class Session:
         self.end, self._is_timed, self._slept = -1, False, 0
         self._start_potential = 0.0
         self.stopped_by = self.signal = ""
-        self.is_unsound = False
+        self.last_trip: Trip | None = None
         self._before_trip = np.empty(0, TICK_DTYPE)
         self._grants: tuple[Grant, ...] = ()
         self._is_begun = self._is_held = self._has_warned = False
@@ -450,10 +449,11 @@ class Session:
         ``error`` is the exception that ended the run; None without one.
         """
         self.is_open = False
-        reason = self.stopped_by if error is None else f"{type(error).__name__}: {error}"
+        is_failed = error is not None and self.last_trip is None
         self.event(
             "stop",
-            reason=reason,
+            reason="error" if is_failed else self.stopped_by,
+            **({} if error is None else {"error": f"{type(error).__name__}: {error}"}),
             **self._signal_detail(),
             overruns=self.overruns,
             skipped=self.skipped,
@@ -511,7 +511,7 @@ class Session:
             (self.kernel.hands or self.kernel.bound).resume()
             self.event("resume", reason=self.stopped_by, **self._signal_detail())
         self.stopped_by = self.signal = ""
-        self.is_unsound = False
+        self.last_trip = None
         self._before_trip = np.empty(0, TICK_DTYPE)
         # a callback that forbids the split may have been set since the bridge was opened
         model, method = self.setup.scene.model, self.setup.method
@@ -615,32 +615,32 @@ class Session:
         if by:
             self.stopped_by, self.signal = by, signal
 
-    def command_zero_force(self) -> str:
-        """Commands zero force; returns the reason if that failed, or an empty text."""
+    def command_zero_force(self) -> Trip | None:
+        """Commands zero force; returns a trip if that failed, or None."""
         try:
             checked_write(self.device)(_NO_FORCE)
         except DeviceError as error:
-            return f"zero force could not be sent: {error}"
-        return ""
+            return Trip(TripCode.ZERO_FORCE, self.tick, detail=str(error))
+        return None
 
-    def trip(self, reason: str) -> SafetyTrip:
+    def trip(self, found: Trip) -> SafetyTrip:
         """Records a trip; returns its exception, with the records of the last second and a remedy.
 
         The remedy is a note of the exception. Its message is the bare reason, as in the recording.
         """
-        self.stopped_by = "trip"
-        self.event("trip", reason=reason, **({"unsound": True} if self.is_unsound else {}))
+        self.stopped_by, self.last_trip = BY_TRIP, found
+        self.event("trip", **found.details())
         self._before_trip = self.stream.latest(1)  # the ring is closed before the summary
-        trip = SafetyTrip(reason, self.stream.latest(round(1.0 / self.setup.period)))
+        trip = SafetyTrip(found.sentence, self.stream.latest(round(1.0 / self.setup.period)))
         work, inputs, created = (
             float(trip.records[name][-1]) if len(trip.records) else 0.0
             for name in ("actuator_work", "external_work", "environment_energy")
         )
         model, data = self.setup.scene.model, self.setup.scene.data
-        pump = first_pump(model) if may_be_pumped(reason) else None
+        pump = first_pump(model) if found.may_be_pumped else None
         if pump is not None:
             trip.add_note(f"{pump.words}; write {pump.change}")
-        elif remedy := trip_remedy(reason, work, created, strongest_actuator(model, data), inputs):
+        elif remedy := found.remedy(work, created, strongest_actuator(model, data), inputs):
             trip.add_note(remedy)
         return trip
 
@@ -662,7 +662,7 @@ class Session:
             recording=self.output.path,
             is_realtime=self.setup.is_realtime,
             start_potential=self._start_potential,
-            is_unsound=self.is_unsound,
+            trip=self.last_trip,
         )
         hands = [
             Summary.from_state(

@@ -17,10 +17,27 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.arguments import check_fields, is_number, option, shown
-from hapticbridge.certificate import default_coupling
 from hapticbridge.clock import RATE, Clock, RealClock, period_of
-from hapticbridge.commands import CouplingLimits
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import default_coupling
+from hapticbridge.demand.guard import (
+    DEVICE_LIMITS,
+    UNLIMITED,
+    Limits,
+    button_mask,
+    guard_parameters_for,
+    limits_for,
+    refuse_simulated_time,
+)
+from hapticbridge.demand.loop_setting import LoopSetting
+from hapticbridge.demand.methods import (
+    Contact,
+    Method,
+    default_method,
+    method_named,
+    require_hazard_consent,
+    resolve_contact_stiffness,
+)
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.base import calling_on_error
 from hapticbridge.device.simulated.dynamics import DEFAULT_HAND
@@ -29,15 +46,6 @@ from hapticbridge.errors import (
     HapticBridgeError,
     RecordingError,
     SceneError,
-)
-from hapticbridge.guard import (
-    DEVICE_LIMITS,
-    UNLIMITED,
-    Limits,
-    button_mask,
-    guard_parameters_for,
-    limits_for,
-    refuse_simulated_time,
 )
 from hapticbridge.kernel.parameters import (
     MAX_BUTTONS,
@@ -51,20 +59,18 @@ from hapticbridge.kernel.parameters import (
     refuse_substeps,
     rotation_numbers,
 )
-from hapticbridge.loop_setting import LoopSetting
-from hapticbridge.pose import IDENTITY_POSE
+from hapticbridge.kernel.pose import IDENTITY_POSE
 from hapticbridge.realtime import busy_step_time, scene_ticks_for, wants_real_time
-from hapticbridge.rehearsal import TIPPED, holding_force, start_handle, static_load, toppling_force
-from hapticbridge.rendering import (
-    Contact,
-    Method,
-    default_method,
-    method_named,
-    require_hazard_consent,
-    resolve_contact_stiffness,
-)
+from hapticbridge.run.commands import CouplingLimits
 from hapticbridge.scene import Scene
 from hapticbridge.scene.physics import site_inertia
+from hapticbridge.scene.rehearsal import (
+    TIPPED,
+    holding_force,
+    start_handle,
+    static_load,
+    toppling_force,
+)
 
 # Options of a user
 
@@ -579,7 +585,7 @@ class RunSetup:
 
         Args:
             start: The device's first sample, ``SAMPLE_DTYPE``, shape (1,).
-            effective: Result of ``rendering.prepare``; the handle starts at the scene's grip.
+            effective: Result of ``methods.prepare``; the handle starts at the scene's grip.
 
         Raises:
             HapticBridgeError: A value is out of range.

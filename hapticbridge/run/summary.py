@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,26 +13,24 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.certificate import (
-    condition_sentences,
-    is_run_certified,
-    run_conditions,
-    worst_verdict,
-)
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import condition_sentences
+from hapticbridge.demand.certification import (
+    Certification,
+    Standing,
+    certification_of,
+    worst_certification,
+)
+from hapticbridge.demand.loop_setting import fresh_share
+from hapticbridge.demand.methods import Method, RunCoupling, default_method, method_named
+from hapticbridge.demand.timekeeping import RunTimes, Timekeeping
+from hapticbridge.demand.trip import Trip
 from hapticbridge.device import DeviceInfo
-from hapticbridge.hand_energy import INSTANT, HandEnergy, worst_of
 from hapticbridge.kernel.codes import Grip, Scheme, coupling_ids, held_body
+from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.loop_setting import fresh_share
-from hapticbridge.record import TickFlag
-from hapticbridge.rendering import Method, RunCoupling, default_method, method_named
-from hapticbridge.timekeeping import (
-    NO_DAMPING,
-    RunTimes,
-    Timekeeping,
-)
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.units import energy_rows, format_share, format_si, format_wrenches
 
 # Sentences on the effective coupling and its law
@@ -155,7 +153,7 @@ class RunOutcome:
         recording: The recording, or None.
         is_realtime: True if real time was requested from the system.
         start_potential: Potential energy in J before the first tick.
-        is_unsound: True if a trip leaves the simulation itself in doubt (``guard.is_unsound``).
+        trip: Stop by the guard; None without one.
     """
 
     ticks: int
@@ -166,7 +164,7 @@ class RunOutcome:
     recording: Path | None
     is_realtime: bool
     start_potential: float
-    is_unsound: bool = False
+    trip: Trip | None = None
 
 
 WELD = "the weld in its stiffest directions at the start"
@@ -215,28 +213,23 @@ class Summary:
             one.
         coupling: Requested, law and effective coupling. For a weld the effective one is that of its
             stiffest axes, measured at the start.
-        fault: Tick and port (``environment`` or ``device``) of the first fault, or None. With a
-            coupling law the device port has no fault here: unpaid energy to the hand refutes the
-            certificate, and the audit of the recording decides.
+        fault: Tick and port (``environment`` or ``device``) of the first fault, or None. A device
+            that does not meet its condition behind a coupling law is judged by the audit alone.
         conditions: Device conditions, as sentences.
-        is_certified: True if b >= scale · force_scale · (KT/2 + B_law) holds for the device in
-            translation and rotation, the run kept its time, the force did not swing as a late one
-            does, and the hand got no unpaid energy. None if its damping is unknown, or
-            if no coupling law makes the condition sufficient.
-        timekeeping: Time that the run kept, and the device conditions at this time.
+        certification: Verdict on the device, by its conditions and by what the run was; of several
+            hands, of the worst.
         stopped_by: ``duration``, ``signal``, ``trip``, ``caller``, or another caller of
             ``Bridge.stop``.
         recording: The recording, or None.
         reach: Distance in m of the device from the origin of its frame beyond which it moved
             without handle and force; None without such a limit.
         has_hand: True if the device gives its force to a hand; a prescribed motion does not.
-        hand_energy: Energy that the hand got and what paid for it; of several, of the worst.
         start_potential: Potential energy in J before the first tick; its zero is arbitrary.
         grip: Name of the grip that the hand holds.
         device: Name of the device.
-        is_unsound: True if a trip leaves the simulation itself in doubt (``guard.is_unsound``).
+        trip: Stop by the guard; None without one.
         hands: Summary of each hand by itself, if several hold the scene. Fault, share of the slack
-            and ``is_certified`` of the whole are then those of all of them.
+            and certification of the whole are then those of all of them.
     """
 
     ticks: int
@@ -258,50 +251,51 @@ class Summary:
     coupling: RunCoupling
     fault: tuple[int, str] | None
     conditions: tuple[str, ...]
-    is_certified: bool | None
-    timekeeping: Timekeeping
+    certification: Certification
     stopped_by: str
     recording: Path | None
     reach: float | None
     has_hand: bool
-    hand_energy: HandEnergy = field(default_factory=HandEnergy)
     start_potential: float = 0.0
     grip: str = ""
     device: str = ""
-    is_unsound: bool = False
+    trip: Trip | None = None
     hands: tuple[Summary, ...] = ()
 
     def at_record(self, record: np.void) -> Summary:
         """Returns the summary with the energies of a tick's record."""
         names = record.dtype.names or ()
         found = {name: float(record[name]) for name in self.energies if name in names}
-        hand = replace(
-            self.hand_energy, motors=found["actuator_work"], inputs=found["external_work"]
-        )
-        return replace(self, energies=self.energies | found, hand_energy=hand)
+        works = {"motors": found["actuator_work"], "inputs": found["external_work"]}
+        own = replace(self.certification, energy=replace(self.hand_energy, **works))
+        return replace(self, energies=self.energies | found, certification=own)
 
     @staticmethod
     def of_hands(hands: tuple[Summary, ...]) -> Summary:
         """Returns the summary of a run of several hands; the rest is that of the first."""
         faults = [each.fault for each in hands if each.fault is not None]
-        certified = [each.is_certified for each in hands]
         return replace(
             hands[0],
             hands=hands,
             fault=min(faults, default=None),
             slack_share=max(each.slack_share for each in hands),
-            is_certified=worst_verdict(certified),
-            hand_energy=worst_of([each.hand_energy for each in hands]),
+            certification=worst_certification([each.certification for each in hands]),
         )
 
     def to_dict(self) -> dict[str, Any]:
         """Returns all fields by name, with the verdict; ``hands`` only where there are several."""
-        values = asdict(self) | {"verdict": self.verdict, "max_net_energy": self.max_net_energy}
+        values = self._values()
         for each in values["hands"]:  # the file is that of all hands
             del each["hands"], each["recording"]
         if not self.hands:
             del values["hands"], values["grip"], values["device"]
         return values
+
+    def _values(self) -> dict[str, Any]:
+        values = asdict(self) | {"verdict": self.verdict, "max_net_energy": self.max_net_energy}
+        values["hands"] = [each._values() for each in self.hands]
+        del values["certification"]
+        return values | {"is_certified": self.is_certified} | self.certification.to_dict()
 
     def __str__(self) -> str:
         """Describes the run: energies, verdict, coupling, device condition and the next command."""
@@ -340,7 +334,7 @@ class Summary:
         used = f", {used}" if self.slack_share else ""
         since = f", from tick {tick} on" if port else ""
         judged = "" if port else "environment "  # the device has a line of its own
-        until = ", then the guard stopped the run" if self.stopped_by == "trip" else ""
+        until = ", then the guard stopped the run" if self.trip else ""
         yield f"{judged}{self.verdict} ({port or self.environment}){until}{since}{used}"
         if self.method != default_method().name:
             yield f"method {self.method}: {self.about}"
@@ -367,7 +361,7 @@ class Summary:
         if remark := self.timekeeping.remark:
             yield "time kept", remark
         if silence := self.timekeeping.silence:
-            yield "silence", silence
+            yield "silence", silence.sentence
         hand = self.peak_force, self.peak_torque
         tool = self.peak_tool_force, self.peak_tool_torque
         reached = " and ".join(f"{name} limit" for name in self.limits_reached)
@@ -389,21 +383,30 @@ class Summary:
 
     def _device_lines(self) -> Iterator[str]:
         """Yields if the device bears the coupling at the time that the run kept."""
-        kept = self.timekeeping
-        if not self.has_hand:
-            yield "the device feels no force: there is nothing to certify"
+        found = self.certification
+        if found.is_by_time:
+            yield f"device not certified: {found.reason}"
             return
-        if self.is_certified is False and kept.fault:
-            yield f"device not certified: {kept.fault}"
-            return
-        if self.is_certified is None and not self.conditions:
-            yield f"device not judged: {NO_DAMPING}{kept.slowness}"
-            return
-        yield kept.device_words(self.is_certified, self.hand_energy)
-        if not self.is_certified:
+        yield found.words
+        if not found.verdict and found.standing is not Standing.NO_HAND:
             yield from self.conditions
-        if self.is_certified is False and method_named(self.method).has_law:
+        if found.verdict is False and method_named(self.method).has_law:
             yield "only --energy-limit bounds what the hand gets"
+
+    @property
+    def is_certified(self) -> bool | None:
+        """True if the device bears the coupling as the run was; None if that is unknown."""
+        return self.certification.verdict
+
+    @property
+    def timekeeping(self) -> Timekeeping:
+        """Time that the run kept, and the device conditions at this time."""
+        return self.certification.kept
+
+    @property
+    def hand_energy(self) -> HandEnergy:
+        """Energy that the hand got and what paid for it; of several, of the one that decides."""
+        return self.certification.energy
 
     @property
     def verdict(self) -> str:
@@ -413,7 +416,7 @@ class Summary:
         """
         if self.fault is not None:
             return "active"
-        return "unverified" if self.is_unsound else "passive"
+        return "unverified" if self.trip and self.trip.is_unsound else "passive"
 
     @classmethod
     def from_state(
@@ -427,7 +430,6 @@ class Summary:
     ) -> Summary:
         """Builds the summary of a run from the kernel's state and the loop's counters."""
         ledger = Ledger.from_state(state)
-        conditions = run_conditions(info, parameters, method)
         timing = state["timing"][0]
         due, new = outcome.ticks + outcome.skipped, int(state["guard"]["fresh"][0])
         times = RunTimes(
@@ -440,17 +442,15 @@ class Summary:
             delay_energy=float(timing["max_uncovered"]),
             is_realtime=outcome.is_realtime,
             flags=int(state["watch"]["flags"][0]),
-            has_tripped=outcome.stopped_by == "trip",
+            has_tripped=outcome.trip is not None,
             scene_steps=int(state["shown"]["scene_step"][0]),
             scene_silence=parameters.period * int(state["shown"]["longest_silence"][0]),
             silence=float(state["guard"]["longest_silence"][0]),
             silent_tick=int(state["guard"]["silent_tick"][0]),
         )
         peaks: dict[str, Any] = {name: float(state["loop"][name][0]) for name in _PEAKS}
-        timekeeping = Timekeeping.from_times(
-            times, parameters, conditions if method.has_law else ()
-        )
         hand = HandEnergy() if info.is_prescribed else _hand_energy(state, parameters)
+        certification = certification_of(info, parameters, method, times, hand)
         return cls(
             ticks=outcome.ticks,
             duration=(outcome.ticks + outcome.skipped) * parameters.period,
@@ -479,20 +479,28 @@ class Summary:
                 and not parameters.scene_ticks
                 and not state["lossless"]["ticks"][0],
             ).felt_at(parameters.grip, parameters.scale, parameters.force_scale),
-            fault=ledger.fault,
+            fault=_fault(ledger, state, certification),
             conditions=condition_sentences(info, parameters, method),
-            is_certified=timekeeping.certified(is_run_certified(conditions, method), hand),
-            timekeeping=timekeeping,
+            certification=certification,
             stopped_by=outcome.stopped_by,
             recording=outcome.recording,
             reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,
             has_hand=not info.is_prescribed,
-            hand_energy=hand,
             start_potential=outcome.start_potential,
-            is_unsound=outcome.is_unsound,
+            trip=outcome.trip,
             grip=parameters.grip,
             device=info.name,
         )
+
+
+def _fault(
+    ledger: Ledger, state: NDArray[np.void], certification: Certification
+) -> tuple[int, str] | None:
+    """Returns the ledger's first fault, or unpaid energy of a device that meets its condition."""
+    unpaid = int(state["observer"]["first_unpaid"][0])
+    if unpaid < 0 or not certification.is_borne:
+        return ledger.fault
+    return min((unpaid, "device"), ledger.fault or (unpaid, "device"))
 
 
 def _hand_energy(state: NDArray[np.void], parameters: RunParameters) -> HandEnergy:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.files import import_extra, reason_of
-from hapticbridge.record import (
+from hapticbridge.kernel.record import (
     FLAG_LEGEND,
     TICK_DTYPE,
     TableColumns,
@@ -26,7 +26,7 @@ from hapticbridge.record import (
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.reader import CUTTING_EVENTS, hand_named
 from hapticbridge.recording.ros_messages import HANDLE, TOOL, axes_of
-from hapticbridge.run_description import meta_float
+from hapticbridge.run.description import meta_float
 
 # Interface of table writers
 

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import (
     WARNINGS,
     Scheme,
@@ -27,12 +26,13 @@ from hapticbridge.kernel.codes import (
     held_body,
     warning_words,
 )
+from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.lossless import tree_of_tool
 from hapticbridge.kernel.mujoco_c import quiet, warning_at
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.pose import IDENTITY_POSE
 from hapticbridge.kernel.rigid_contact import finish_contacts
 from hapticbridge.kernel.state import BoundKernel, Place
-from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.scene import Scene
 from hapticbridge.scene.compile import clause
 from hapticbridge.scene.handle import PROBE

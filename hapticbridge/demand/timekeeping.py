@@ -8,7 +8,9 @@ once. A run certifies its device only if it kept its time, which means two thing
 
        b >= N (1/s + j/T) + 3 κ t_d/T,    κ = (K T/2)²/N
 
-   s is the smaller of two shares: deadlines that were kept, and samples that were new. j is the
+   s is the smaller of two shares: deadlines that were kept, and samples that were new. In ticks
+   without a new sample the tool moves, so that these ask for m (m − 1) (K T)²/(4 N) more, with one
+   new sample in m ticks on average. j is the
    mean time by which a sample came later after its deadline than the one before; 0 if earlier.
 
 2. Single delays gave the hand at most ``INSTANT`` in energy beyond what b burned
@@ -23,15 +25,17 @@ springs cannot pay for it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
-from hapticbridge.certificate import UNPROVED, DampingCondition
-from hapticbridge.hand_energy import INSTANT, HandEnergy
+from hapticbridge.demand.certificate import DampingCondition
+from hapticbridge.kernel.hand_energy import INSTANT
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.kernel.swing_watch import PUSH, STAND
 from hapticbridge.kernel.timing import DELAY_PRICE
-from hapticbridge.record import TickFlag
 from hapticbridge.units import format_si
 
 NOT_KEPT = "the run did not keep its time"
@@ -43,20 +47,6 @@ SLOW_MOTION = 0.95
 SILENT_PERIODS = 10.0
 """Periods of a slower scene without a result above which the time is named. A late result is usual;
 after ten, a hand has met a tool that stands still."""
-
-SWUNG = "its force came late, reversed or in steps"
-UNKNOWN = "it is not known whether its motors push the right way"
-"""Words for what the watch found, and for what it could not find (``kernel.swing_watch``)."""
-
-STEPS_UNKNOWN = "its encoder's steps are not judged"
-"""Limit of the certificate of a device whose resolution or friction is unknown."""
-
-
-NO_DAMPING = (
-    "its damping is unknown; 'hapticbridge identify' measures it, or its class states it in "
-    "DeviceInfo(damping=..., delay=...)"
-)
-"""Reason why a device is not judged, with the next step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,44 +87,82 @@ class RunTimes:
     silent_tick: int = 0
 
 
-def silence_sentence(times: RunTimes, parameters: RunParameters) -> str:
-    """Describes a silence of the device after which the force fades; empty without one."""
+@dataclass(frozen=True, slots=True)
+class Silence:
+    """Silence of a device after which the force faded.
+
+    Attributes:
+        length: Time in s without a new sample.
+        begin: Time in s of the run at which it began.
+    """
+
+    length: float
+    begin: float
+
+    @property
+    def sentence(self) -> str:
+        """Length, and time of the run."""
+        return (
+            f"the device gave no new sample for {format_si(self.length, 's')} (at "
+            f"{self.begin:.1f} s), and the force faded"
+        )
+
+
+def silence_in(times: RunTimes, parameters: RunParameters) -> Silence | None:
+    """Returns the longest silence of the device after which the force faded; None without one."""
     period, most = parameters.period, parameters.guarding.stale_ticks
     if not most or times.silence <= (most + 0.5) * period:
-        return ""
-    begin = max((times.silent_tick + 1) * period - times.silence, 0.0)
-    return (
-        f"the device gave no new sample for {format_si(times.silence, 's')} (at {begin:.1f} s), "
-        "and the force faded"
-    )
+        return None
+    return Silence(times.silence, max((times.silent_tick + 1) * period - times.silence, 0.0))
 
 
-def watch_sentence(flags: int) -> str:
-    """Describes what the watch did to the force (``kernel.swing_watch``), with the remedy.
+class Alarm(StrEnum):
+    """Finding of the watch for a late or reversed force (``kernel.swing_watch``)."""
 
-    Args:
-        flags: Combined flags of a run's records; without the watch's own the text is empty.
-    """
-    if flags & int(TickFlag.RUNS_AWAY):
-        return (
-            "the force was taken away because the device did not move as it was pushed: an axis is "
-            "reversed or exchanged (check the axes and signs of the device) or the force comes "
-            "very late"
-        )
-    if flags & int(TickFlag.SWINGING):
-        return (
-            "the force was lowered because the device swung: it answered late, or in coarse steps, "
-            "or an axis is reversed; check the signs of its axes, lower --stiffness, and measure "
-            "its delay and resolution ('hapticbridge identify')"
-        )
-    if flags & int(TickFlag.UNANSWERED):
+    RUNS_AWAY = "runs away"
+    SWINGS = "swings"
+    UNANSWERED = "unanswered"
+
+    @staticmethod
+    def of(flags: int) -> Alarm | None:
+        """Returns the gravest finding among the flags of a run's records; None without one."""
+        for flag, alarm in (
+            (TickFlag.RUNS_AWAY, Alarm.RUNS_AWAY),
+            (TickFlag.SWINGING, Alarm.SWINGS),
+            (TickFlag.UNANSWERED, Alarm.UNANSWERED),
+        ):
+            if flags & int(flag):
+                return alarm
+        return None
+
+    @property
+    def words(self) -> str:
+        """Name of the finding in a clause."""
+        if self is Alarm.UNANSWERED:
+            return "it is not known whether its motors push the right way"
+        return "its force came late, reversed or in steps"
+
+    @property
+    def sentence(self) -> str:
+        """Action of the watch on the force, and the remedy."""
+        if self is Alarm.RUNS_AWAY:
+            return (
+                "the force was taken away because the device did not move as it was pushed: an "
+                "axis is reversed or exchanged (check the axes and signs of the device) or the "
+                "force comes very late"
+            )
+        if self is Alarm.SWINGS:
+            return (
+                "the force was lowered because the device swung: it answered late, or in coarse "
+                "steps, or an axis is reversed; check the signs of its axes, lower --stiffness, "
+                "and measure its delay and resolution ('hapticbridge identify')"
+            )
         force, torque = (format_si(*pair) for pair in zip(PUSH, ("N", "N m"), strict=True))
         return (
             f"the device was pushed with {force} ({torque}) or more for {format_si(STAND, 's')} "
-            f"and stood, and did not come against the force when that was lowered: {UNKNOWN}; move "
-            "the handle away from its stop and start again"
+            "and stood, and did not come against the force when that was lowered: "
+            f"{self.words}; move the handle away from its stop and start again"
         )
-    return ""
 
 
 MANY_KEPT = 0.95
@@ -163,13 +191,11 @@ class Timekeeping:
         is_kept: True if all conditions hold and the energy is at most ``INSTANT``; None if no
             condition holds even for a run in time.
         is_realtime: True if real time was requested from the system.
-        watch: What the watch for a late or reversed force did, in a sentence; empty for nothing.
-        law_evaluations: Evaluations of the law per tick.
-        has_tripped: True if the guard stopped the run.
+        alarm: Finding of the watch for a late or reversed force; None without one.
         scene_rate: Results per second in Hz that a slower scene was to give; None for another.
         scene_speed: Share of them that it gave, 0 to 1.
         scene_silence: Longest time in s without a new one.
-        silence: Longest silence of the device, in a sentence; empty if no force faded for it.
+        silence: Longest silence of the device for which the force faded; None without one.
         sample_rate: New samples per second of a device slower than the loop; 0 for another.
     """
 
@@ -183,13 +209,11 @@ class Timekeeping:
     in_time: tuple[DampingCondition, ...]
     is_kept: bool | None
     is_realtime: bool
-    watch: str
-    law_evaluations: int
-    has_tripped: bool
+    alarm: Alarm | None
     scene_rate: float | None
     scene_speed: float
     scene_silence: float
-    silence: str
+    silence: Silence | None
     sample_rate: float
 
     @classmethod
@@ -199,9 +223,11 @@ class Timekeeping:
         """Judges the times of a run by its device conditions; none for a run without a law."""
         share = times.ticks / times.due if times.due > times.ticks else 1.0
         least = min(share, times.fresh)
-        silence = silence_sentence(times, parameters)
+        silence = silence_in(times, parameters)
         is_felt = parameters.has_law and (not conditions or any(c.is_felt for c in conditions))
-        sample_rate = _sample_rate(times, parameters.period, bool(silence)) if is_felt else 0.0
+        sample_rate = (
+            _sample_rate(times, parameters.period, silence is not None) if is_felt else 0.0
+        )
         remedy = _remedy(is_realtime=times.is_realtime, sample_rate=sample_rate)
         late = tuple(_at_times(each, parameters, least, times, remedy) for each in conditions)
         verdicts = [each.holds for each in late if each.available is not None]
@@ -217,74 +243,13 @@ class Timekeeping:
             in_time=tuple(conditions),
             is_kept=all(verdicts) and times.delay_energy <= INSTANT if is_borne else None,
             is_realtime=times.is_realtime,
-            watch=watch_sentence(times.flags),
-            law_evaluations=parameters.law_evaluations,
-            has_tripped=times.has_tripped,
+            alarm=Alarm.of(times.flags),
             scene_rate=1.0 / parameters.scene_period if parameters.scene_ticks else None,
             scene_speed=_scene_speed(times, parameters.scene_ticks),
             scene_silence=times.scene_silence,
             silence=silence,
             sample_rate=sample_rate,
         )
-
-    def certified(self, verdict: bool | None, energy: HandEnergy) -> bool | None:
-        """Returns a verdict on the device, False if the run was not as it assumes."""
-        is_refuted = self.is_kept is False or self.watch
-        is_spoiled = verdict and (self.has_tripped or energy.fault)
-        return False if is_refuted or is_spoiled else verdict
-
-    def device_words(self, verdict: bool | None, energy: HandEnergy) -> str:
-        """Returns the verdict on the device in a clause; ``fault`` has the reason in full."""
-        steps = [each.steps for each in self.in_time if each.steps is not None]
-        if verdict:
-            limit = f", but {energy.limit}" if energy.limit else ""
-            if any(each.holds is None for each in steps):
-                limit = f"; {STEPS_UNKNOWN}{limit}"
-            return f"device certified{self.clause}: b >= {self._bound}{limit}"
-        if verdict is None:
-            return f"device not judged: {self._unproved}{self.slowness}"
-        if reason := self.refutation(energy):
-            return f"device not certified: {reason}"
-        return f"device not certified: {self.lack}"
-
-    @property
-    def lack(self) -> str:
-        """Clause on what the device has too little of for the coupling."""
-        is_shaken = any(each.steps and each.steps.holds is False for each in self.in_time)
-        if is_shaken and not any(each.is_damped is False for each in self.in_time):
-            return "friction < K Δ/2 + B_law Δ/T, so encoder steps shake it"
-        return f"b < {self._bound}"
-
-    @property
-    def _unproved(self) -> str:
-        """Number that is missing for a verdict on the device, in a clause."""
-        on_hand = [each for each in self.in_time if each.is_felt]
-        if any(each.available is None for each in on_hand):
-            return NO_DAMPING
-        if any(each.delay is None for each in on_hand):
-            return "its delay is unknown ('hapticbridge identify' measures it)"
-        if any(each.delay for each in on_hand):
-            return f"it answers late, and {UNPROVED}"
-        return "nothing proves that it bears the coupling"
-
-    def refutation(self, energy: HandEnergy) -> str:
-        """Returns the reason in the run itself why its device is not certified, or nothing."""
-        if self.is_kept is False:
-            return NOT_KEPT
-        if self.watch:
-            return UNKNOWN if UNKNOWN in self.watch else SWUNG
-        if energy.fault and all(each.holds for each in self.in_time):
-            return energy.fault
-        is_cause = self.has_tripped and self.is_kept is not None
-        return "the guard stopped the run" if is_cause else ""
-
-    @property
-    def _bound(self) -> str:
-        samples = max((each.ticks_per_sample for each in self.in_time), default=1)
-        if samples > 1:
-            return f"what one sample in {samples} ticks needs"
-        count = self.law_evaluations
-        return "KT/2 + B_law" if count == 1 else f"what {count} substeps need"
 
     @property
     def words(self) -> str:
@@ -352,11 +317,7 @@ class Timekeeping:
 
     @property
     def fault(self) -> str:
-        """Sentence on the time that was not kept or on a late force, with the remedy; or empty."""
-        return "; ".join(text for text in (self._not_kept, self.watch) if text)
-
-    @property
-    def _not_kept(self) -> str:
+        """Sentence on the time that was not kept, with the remedy; or empty."""
         if self.is_kept is not False:
             return ""
         at_times = f"at {self.rate:.4g} Hz{f' ({self._late})' if self._late else ''} it would need"
@@ -364,9 +325,8 @@ class Timekeeping:
         failed = [(late, usual) for late, usual in pairs if late.holds is False]
         if failed:
             late_one, usual = failed[0]
-            unit = "N s/m" if usual.axis == "translation" else "N m s/rad"
             found = (
-                f"{at_times} {late_one.needed:.3g} {unit} of damping in {usual.axis} "
+                f"{at_times} {late_one.needed:.3g} {usual.unit} of damping in {usual.axis} "
                 f"({usual.needed:.3g} with every tick in time), and has {usual.available:.3g}"
             )
         else:
@@ -375,7 +335,7 @@ class Timekeeping:
                 f"{format_si(self.delay_energy, 'J')}, more than {format_si(INSTANT, 'J')}"
             )
         if self.silence and self.share >= MANY_KEPT and not self.sample_rate:
-            return f"{NOT_KEPT}: {self.silence}; check its link and its power ({found})"
+            return f"{NOT_KEPT}: {self.silence.sentence}; check its link and its power ({found})"
         return f"{NOT_KEPT}: {found}{self.slowness or f'; try {self.remedy}'}"
 
 
@@ -419,18 +379,18 @@ def _at_times(
     if not condition.is_felt:
         return condition
     coupling = parameters.effective or parameters.coupling
-    stiffness = parameters.scale * parameters.force_scale * coupling.stiffness
+    ratio, k, b = parameters.scale * parameters.force_scale, coupling.stiffness, coupling.damping
     if condition.axis == "rotation":
         ratio = parameters.force_scale / parameters.scale
-        stiffness = ratio * coupling.rotational_stiffness
-    needed = condition.needed * (1.0 / share + times.mean_jitter / parameters.period)
-    if stiffness > 0.0:
-        held = condition.ticks_per_sample * parameters.period
-        # of one force for n ticks the price of a spring alone, which is the larger one
-        price = DELAY_PRICE * 0.5 * stiffness * condition.ticks_per_sample
-        if condition.ticks_per_sample == 1:
-            price *= 0.5 * stiffness * held / condition.needed
-        needed += price * times.mean_delay
+        k, b = coupling.rotational_stiffness, coupling.rotational_damping
+    ticks, period = condition.ticks_per_sample, parameters.period
+    needed = condition.needed * (1.0 / share + times.mean_jitter / period)
+    if k > 0.0:
+        kappa = 0.5 * k / (1.0 + 2.0 * b / (k * period))  # κ/T
+        # samples that did not come: the tool moved in the ticks between them
+        count = max(times.ticks / times.new_samples, ticks) if times.new_samples else math.inf
+        needed += ratio * kappa * period * count * (count - ticks)
+        needed += ratio * DELAY_PRICE * ticks * kappa * times.mean_delay
     at_times = replace(condition, needed=needed)
     if at_times.holds is False and condition.holds is not False:
         return replace(at_times, remedy=remedy)

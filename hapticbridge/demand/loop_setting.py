@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import IMPLICIT, Method
 from hapticbridge.device.base import DeviceInfo
 from hapticbridge.errors import CouplingError
 from hapticbridge.kernel.ledger import SLACK_SHARE
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
-from hapticbridge.rendering import IMPLICIT, Method
 from hapticbridge.theory.bounds import late_minimum_damping, minimum_damping
 from hapticbridge.theory.transfer import delayed_by
 

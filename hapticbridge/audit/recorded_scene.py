@@ -18,26 +18,24 @@ from typing import Any
 
 import numpy as np
 
-from hapticbridge import jit
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.kernel.handle import stretch_at
-from hapticbridge.kernel.mujoco_c import library_path
-from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.state import BoundKernel
-from hapticbridge.kernel.tick import simulate_recorded
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.recording import RecordingFile
-from hapticbridge.rehearsal import static_load
-from hapticbridge.rendering import (
+from hapticbridge.demand.methods import (
     check_prepared,
     method_named,
     prepare,
     prepare_hands,
     unguarded_parameters,
 )
-from hapticbridge.request import RunRequest, request_of
-from hapticbridge.run_description import (
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.kernel import jit
+from hapticbridge.kernel.handle import stretch_at
+from hapticbridge.kernel.mujoco_c import library_path
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import simulate_recorded
+from hapticbridge.recording import RecordingFile
+from hapticbridge.run.description import (
     CARRIED,
     SOURCE_PREFIX,
     metas_of,
@@ -46,9 +44,11 @@ from hapticbridge.run_description import (
     parameters_of,
     requested_of,
 )
+from hapticbridge.run.request import RunRequest, request_of
+from hapticbridge.run.slow_scene import SlowScene
 from hapticbridge.scene import Scene, load_scene, scene_parameters
+from hapticbridge.scene.rehearsal import static_load
 from hapticbridge.scene.source import refuse_outside
-from hapticbridge.slow_scene import SlowScene
 
 SIMULATION_TIME, SLOWEST = 15, 20
 """Processor time in s that a simulation may take, and beyond it per second of the run. Machine code

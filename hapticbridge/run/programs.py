@@ -16,9 +16,10 @@ import numpy as np
 
 from hapticbridge.device.simulated.dynamics import STATE_DTYPE as HAND_DTYPE
 from hapticbridge.device.simulated.dynamics import next_sample
-from hapticbridge.jit import Program, examples, prepare
 from hapticbridge.kernel.colliders import C_TYPES, box_box, flat_flat, round_flat
 from hapticbridge.kernel.handle import stretch_at
+from hapticbridge.kernel.jit import Program, examples, prepare
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.kernel.state import STATE_DTYPE
 from hapticbridge.kernel.tick import (
     after_step,
@@ -28,7 +29,6 @@ from hapticbridge.kernel.tick import (
     finish_tick,
     simulate_recorded,
 )
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 
 
 def programs() -> list[Program]:

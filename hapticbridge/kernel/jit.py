@@ -24,7 +24,7 @@ import mujoco
 import numpy as np
 import platformdirs
 
-from hapticbridge import machine_code
+from hapticbridge.kernel import machine_code
 
 _Function = TypeVar("_Function", bound=Callable[..., object])
 
@@ -249,7 +249,7 @@ class Compiled(Deferred):
     def program(self, arguments: tuple[object, ...], c_types: tuple[str, ...] = ()) -> bytes:
         """Returns the function with all that it calls and an entry, as LLVM's bitcode."""
         signature = _signature(arguments)
-        with import_module("hapticbridge.whole_program").whole_program():
+        with import_module("hapticbridge.kernel.whole_program").whole_program():
             self._part.compile(signature)
             found = self._part.overloads[signature]
             return machine_code.program(
@@ -271,7 +271,7 @@ class Compiled(Deferred):
     @property
     def _numba_type_(self) -> Any:
         """Type that numba sees in a caller."""
-        is_part = import_module("hapticbridge.whole_program").is_open()
+        is_part = import_module("hapticbridge.kernel.whole_program").is_open()
         return (self._part if is_part else self.built)._numba_type_
 
     def _decorated(self) -> Any:
@@ -325,7 +325,7 @@ def prepare(programs: Sequence[Program], note: Callable[[int], None]) -> None:
             missing[name] = each
     if not missing:
         return
-    command = [sys.executable, "-c", "from hapticbridge.machine_code import serve; serve()"]
+    command = [sys.executable, "-c", "from hapticbridge.kernel.machine_code import serve; serve()"]
     with TemporaryDirectory(dir=folder) as place:
         child = subprocess.Popen(command, stdin=subprocess.PIPE, text=True)
         assert child.stdin is not None
@@ -345,7 +345,7 @@ def prepare(programs: Sequence[Program], note: Callable[[int], None]) -> None:
                 machine_code.write(folder / name, code)
 
 
-READY_MADE = Path(__file__).with_name("ready_made")
+READY_MADE = Path(__file__).parents[1] / "ready_made"
 """Folder of machine code that was made with the wheel; a checkout has none."""
 
 _callbacks: list[object] = []

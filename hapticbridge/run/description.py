@@ -20,15 +20,16 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.arguments import types_of
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import RIGID, SCENE, Method, method_named
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CouplingError, HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.recording import Attachment
 from hapticbridge.recording.format import HANDS_KEY, further_hands
-from hapticbridge.rendering import RIGID, SCENE, Method, method_named
 from hapticbridge.scene import Scene
 
 # Start of a run: MuJoCo's state, compiled model, and energies
@@ -192,7 +193,9 @@ SOURCE_PREFIX = "scene/"
 CARRIED = "carried"
 """Value of ``tool_weight`` in the metadata if the scene compensates the tool's weight."""
 
-_FLOATS = ("scale", "force_scale", "force_limit", "torque_limit", "contact_stiffness")
+_FLOATS = tuple(
+    name for name, kind in types_of(RunParameters).items() if kind is float and name != "period"
+)
 _POSES = ("device_origin", "handle_origin", "device_start")
 _GAINS = tuple(field.name for field in fields(Coupling))
 

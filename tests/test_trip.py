@@ -1,0 +1,47 @@
+"""A trip as recorded facts: they are read back, and a sentence that differs is damage."""
+
+from __future__ import annotations
+
+import pytest
+
+from hapticbridge.demand.trip import Trip, TripCode
+from hapticbridge.errors import RecordingError
+from hapticbridge.kernel import codes
+
+TRIPS = (
+    Trip(TripCode.JUMPED, 5),
+    Trip(TripCode.STRETCHED, 7, hand="left"),
+    Trip(TripCode.DEVICE, 9, detail="the device 'X' is gone"),
+)
+
+
+@pytest.mark.parametrize("trip", TRIPS, ids=lambda trip: trip.code)
+def test_the_event_of_a_trip_reads_back(trip: Trip) -> None:
+    event = {"event": "trip", "tick": trip.tick, **trip.details()}
+    assert Trip.among([{"event": "start", "tick": 0}, event]) == trip
+    assert Trip.among([{"event": "start", "tick": 0}]) is None
+
+
+@pytest.mark.parametrize(
+    "change", [{"code": "felt bad"}, {"hand": 3}, {"tick": "5"}, {"reason": "nothing happened"}]
+)
+def test_an_event_of_a_trip_that_contradicts_itself_is_refused(change: dict[str, object]) -> None:
+    event = {"event": "trip", "tick": 5, **TRIPS[0].details()} | change
+    with pytest.raises(RecordingError, match="event 'trip'"):
+        Trip.among([event])
+
+
+def test_each_result_of_the_kernel_has_a_code_and_words() -> None:
+    assert Trip.of_result(codes.GAVE_ENERGY, 3, "left").hand == "left"
+    assert Trip.of_result(codes.CONTACTS_FULL, 3, "left").hand == ""  # of the scene, not of a hand
+    assert Trip.of_result(codes.BAD_RESULT, 3).code is TripCode.DIVERGED
+    for code in TripCode:
+        trip = Trip(code, 3, detail="why")
+        assert trip.sentence.startswith("tick 3: ") and "{" not in trip.sentence
+        assert trip.is_unsound is (code in UNSOUND)
+
+
+UNSOUND = (
+    *(TripCode.CONTACTS_FULL, TripCode.CONSTRAINTS_FULL),
+    *(TripCode.DIVERGED, TripCode.SIMULATION),
+)
