@@ -21,7 +21,7 @@ from contextlib import suppress
 from functools import cache
 from itertools import count
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias
 
 import llvmlite.binding as llvm
 import numpy as np
@@ -289,12 +289,12 @@ def _unpacked(a: str, kind: Kind) -> tuple[list[str], list[str]]:
         return [*lines, f"{a}.value = trunc i32 {a}.truth to i8"], [f"i8 {a}.value"]
     if not isinstance(kind[0], np.dtype):
         lines, values = list[str](), list[str]()
-        for number, each in enumerate(cast(tuple[Kind, ...], kind)):
+        for number, each in enumerate(kind):
             code, parts = _unpacked(f"{a}.{number}", each)
             lines += (f"{a}.{number} = call ptr @PyTuple_GetItem(ptr {a}, i64 {number})", *code)
             values += parts
         return lines, values
-    dtype, axes = cast(tuple[np.dtype[Any], int], kind)
+    dtype, axes = kind
     offset = _HEADER if axes else _HEADER + 8
     lines = [
         f"{a}.field = getelementptr i8, ptr {a}, i64 {offset}",
