@@ -122,6 +122,27 @@ def test_no_point_is_moved_beside_the_face(tool: str) -> None:
                 assert outside.max() < (2e-6 if ours else 1e-3)
 
 
+def test_only_functions_that_a_models_shapes_need_are_installed() -> None:
+    code = """
+import ctypes, mujoco
+from hapticbridge.kernel.colliders import install
+from hapticbridge.kernel.mujoco_c import library_path
+table = (ctypes.c_void_p * 81).in_dll(ctypes.CDLL(str(library_path())), "mjCOLLISIONFUNC")
+box, cylinder = int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
+shapes = {"box": "<geom type='box' size='1 1 1'/>", "rod": "<geom type='cylinder' size='1 1'/>"}
+def changed(*names):
+    before = list(table)
+    inside = "".join(shapes[name] for name in names)
+    install(mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{inside}</worldbody></mujoco>"))
+    return [divmod(i, 9) for i in range(81) if table[i] != before[i]]
+print(changed("box", "rod", "rod") == [(cylinder, box)], changed("box", "box") == [(box, box)])
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300
+    )
+    assert result.stdout.split() == ["True", "True"]
+
+
 def test_a_table_that_another_program_changed_is_refused() -> None:
     code = """
 import ctypes, mujoco
@@ -131,9 +152,11 @@ from hapticbridge.kernel.mujoco_c import library_path
 library = ctypes.CDLL(str(library_path()))
 table = (ctypes.c_void_p * 81).in_dll(library, "mjCOLLISIONFUNC")
 box = int(mujoco.mjtGeom.mjGEOM_BOX)
+shape = "<geom type='box' size='1 1 1'/>"
+xml = f"<mujoco><worldbody>{shape}{shape}</worldbody></mujoco>"
 table[9 * box + box] = ctypes.cast(library.mjc_Convex, ctypes.c_void_p).value
 try:
-    install()
+    install(mujoco.MjModel.from_xml_string(xml))
 except SceneError as error:
     print(error)
 """

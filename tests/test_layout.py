@@ -199,6 +199,8 @@ SMALL = 80
 INTERFACES = {
     "hapticbridge.lazy",  # imported by package files, which are not counted
     "hapticbridge.device.transport.maker_library",  # libraries of makers, for any driver
+    "hapticbridge.run.programs",  # run by scripts/setup and the builder of wheels too
+    "hapticbridge.kernel.whole_program",  # imported when something is compiled, with numba
 }
 """Modules that are small on purpose."""
 

@@ -10,6 +10,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ import pytest
 from numpy.typing import NDArray
 
 from hapticbridge.kernel import jit, machine_code
-from hapticbridge.kernel.jit import compiled, direct
+from hapticbridge.kernel.jit import Program, compiled, direct, external, prepare
+from hapticbridge.kernel.jit import compiled_for_threads as threaded
 
 PAIR = np.dtype([("first", "<f8"), ("second", "<i8")])
 
@@ -60,6 +62,11 @@ def raising(table: NDArray[np.float64]) -> int:
     return 1
 
 
+def paired(both: tuple[NDArray[np.float64], NDArray[np.void], int], factor: float) -> float:
+    both[0][0, 0] += factor
+    return float(both[0][2, 3] + both[1][1]["first"] * both[2])
+
+
 def arguments_of_weighted() -> tuple[Any, ...]:
     pairs = np.array([(1.5, 2), (2.5, 3)], PAIR)
     return np.arange(12.0).reshape(3, 4), pairs, pairs[0], 0.1, 7, True
@@ -70,6 +77,7 @@ CASES: dict[str, tuple[Callable[..., Any], Callable[[], tuple[Any, ...]]]] = {
     "truth": (is_above, lambda: (np.ones(1, PAIR)[0], 0.5)),
     "integer": (rows_of, lambda: (np.zeros((3, 4)),)),
     "no result": (clear, lambda: (np.ones((3, 4)),)),
+    "tuple": (paired, lambda: ((np.ones((3, 4)), np.ones(2, PAIR), 3), 0.5)),
     "allocation": (allocating, lambda: (np.ones((3, 4)),)),
 }
 
@@ -96,7 +104,8 @@ def test_machine_code_from_disk_does_what_python_does(name: str, folder: Path) -
         assert answer == result
         assert isinstance(answer, type(result)) or isinstance(result, type(answer))
         for one, other in zip(given, expected, strict=True):
-            assert np.array_equal(one, other)
+            pairs = zip(one, other, strict=True) if isinstance(one, tuple) else ((one, other),)
+            assert all(np.array_equal(*pair) for pair in pairs)
     (path,) = folder.glob("*.o")
     assert bool(machine_code.read(path)) == (name != "allocation")
 
@@ -108,6 +117,75 @@ def test_an_exception_is_raised_although_machine_code_cannot(folder: Path) -> No
         function(np.ones((1, 1)))
     (path,) = folder.glob("*.o")
     assert machine_code.read(path) == b""
+
+
+_yield = external("sched_yield", "int32()")
+
+
+def waiting(flags: NDArray[np.int64], turns: int) -> int:
+    """Waits until another thread sets the first flag; gives up after some turns."""
+    for turn in range(turns):
+        if flags[0]:
+            return turn
+        _yield()
+    return -1
+
+
+@pytest.mark.parametrize(("compile_it", "is_released"), [(compiled, False), (threaded, True)])
+def test_machine_code_for_threads_releases_the_lock(
+    compile_it: Callable[[Any], Any], is_released: bool, folder: Path
+) -> None:
+    flags = np.zeros(1, np.int64)
+    function = direct(compile_it(waiting), flags, 1)
+    (path,) = folder.glob("*.o")
+    assert machine_code.read(path)
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(function, flags, 10_000_000 if is_released else 1000)
+        while not is_released and not answer.done():
+            pass
+        flags[0] = 1
+        assert (answer.result() >= 0) == is_released
+
+
+def refuse_to_compile(self: Any, *_: object) -> bytes:
+    raise AssertionError(f"{self.source.__name__} is compiled")
+
+
+def test_what_was_prepared_is_not_compiled_again(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table, left = np.zeros((3, 4)), list[int]()
+    wanted = [Program(compiled(each), (table,)) for each in (rows_of, clear, allocating)]
+    prepare(wanted, left.append)
+    assert left == [3, 2, 1]
+    assert sorted(path.name.partition("-")[0] for path in folder.iterdir()) == [
+        "allocating",
+        "clear",
+        "rows_of",
+    ]
+    monkeypatch.setattr(jit.Compiled, "program", refuse_to_compile)
+    prepare(wanted, left.append)
+    assert left == [3, 2, 1]
+    assert direct(compiled(rows_of), table)(table) == 43
+    assert direct(compiled(allocating), table)(table) == 0.0  # by numba
+
+
+def test_code_made_with_the_wheel_is_used_where_it_fits(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = np.zeros((3, 4))
+    direct(compiled(rows_of), table)
+    (path,) = folder.glob("*.o")
+    (tmp_path / "wheel").mkdir()
+    path.rename(tmp_path / "wheel" / path.name)
+    monkeypatch.setattr(jit, "READY_MADE", tmp_path / "wheel")
+    with monkeypatch.context() as context:
+        context.setattr(jit.Compiled, "program", refuse_to_compile)
+        assert direct(compiled(rows_of), table)(table) == 43
+    assert not list(folder.iterdir())
+    monkeypatch.setattr(jit, "_environment", lambda: "another level of the processor")
+    assert direct(compiled(rows_of), table)(table) == 43
+    assert [each.name != path.name for each in folder.glob("*.o")] == [True]
 
 
 @pytest.mark.parametrize(
@@ -170,11 +248,11 @@ def test_a_folder_that_cannot_be_written_costs_only_time(
 
 def test_code_that_numba_cannot_write_goes_nowhere_else(folder: Path) -> None:
     table = np.zeros((3, 4))
-    assert compiled(rows_of)(table) == 43
-    (own,) = folder.glob("rows_of-*")
+    assert compiled(allocating)(table) == 0.0
+    (own,) = (path for path in folder.glob("allocating-*") if path.is_dir())
     shutil.rmtree(own)
     own.touch()  # a file where numba wants a folder
-    assert compiled(rows_of)(table) == 43
+    assert compiled(allocating)(table) == 0.0
     assert not list((Path(__file__).parent / "__pycache__").glob("test_machine_code*.nb?"))
 
 

@@ -47,6 +47,7 @@ from hapticbridge.run.options import (
     steady_rotational_stiffness,
     steady_stiffness,
 )
+from hapticbridge.run.programs import prepare_run, words
 from hapticbridge.run.summary import WELD, Summary, coarse_spring, is_always_implicit
 from hapticbridge.scene import (
     Scene,
@@ -335,6 +336,7 @@ class Run:
             interrupts = stack.enter_context(interrupting_on_signals())
             with err.status("reading the scene …"):
                 source = read_scene(self.scene, **settings_from(self.settings))
+            prepare_run(lambda left: notify(words(left)))
             held = self._completed(held, own_grips(source))
             if len(held) > 1:
                 return self._run_hands(source, held, clock, stack, window, interrupts)
@@ -537,7 +539,7 @@ class Run:
         if not self.as_json:
             for setup in bridge.setups:
                 announce(setup, self.coupling, is_method_chosen=options.method is not None)
-        with err.status("preparing (the first run on a machine compiles for about a minute) …"):
+        with err.status("preparing …"):
             stack.enter_context(bridge)
         interrupts.hand_over(bridge.stop_on_signal)  # also while it closes: never cut short
         if window is not None:

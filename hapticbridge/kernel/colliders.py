@@ -90,7 +90,7 @@ _SIGNATURE = "int32(intp, intp, intp, int32, int32, float64)"
 _mjc_box_box: Any = external("mjc_BoxBox", _SIGNATURE)
 _mjc_convex: Any = external("mjc_Convex", _SIGNATURE)
 
-_C_TYPES = ("i64", "i64", "i64", "i32", "i32", "double")
+C_TYPES = ("i64", "i64", "i64", "i32", "i32", "double")
 """Arguments of ``mjfCollision``: model, data, points, two geoms, margin."""
 
 
@@ -315,33 +315,53 @@ def _is_inside(model: int, geom: int, flat: Any, shape: Any, p: Any) -> bool:
 # The table, and the models that use these functions
 
 
+def _replacement(first: int, second: int) -> Any:
+    """Returns the function that takes a pair's place in the table."""
+    if first == second == _BOX:
+        return box_box
+    return round_flat if first in (_CAPSULE, _CYLINDER) else flat_flat
+
+
+_PAIRS = (
+    (_BOX, _BOX),
+    (_CAPSULE, _MESH),
+    (_CYLINDER, _BOX),
+    (_CYLINDER, _MESH),
+    (_BOX, _MESH),
+    (_MESH, _MESH),
+)
+
+
 @cache
-def install() -> None:
-    """Puts the functions into MuJoCo's table, once in a process.
+def _install(first: int, second: int) -> None:
+    """Puts the function of a pair into MuJoCo's table, once in a process."""
+    library = ctypes.CDLL(str(library_path()))
+    kinds = int(mujoco.mjtGeom.mjNGEOMTYPES)
+    table = (ctypes.c_void_p * kinds**2).in_dll(library, "mjCOLLISIONFUNC")
+    stock = library.mjc_BoxBox if first == second == _BOX else library.mjc_Convex
+    if table[kinds * first + second] != ctypes.cast(stock, ctypes.c_void_p).value:
+        raise SceneError(
+            "another program has replaced MuJoCo's collision functions in this process; run "
+            "without it, or choose contact 'scene'"
+        )
+    table[kinds * first + second] = _address(_replacement(first, second))
+
+
+@cache
+def _address(function: Any) -> int:
+    return callback(function, *C_TYPES)
+
+
+def install(model: mujoco.MjModel) -> None:
+    """Puts the functions that a model's shapes need into MuJoCo's table.
 
     Raises:
         SceneError: Another program has put a function of its own into the table.
     """
-    library = ctypes.CDLL(str(library_path()))
-    kinds = int(mujoco.mjtGeom.mjNGEOMTYPES)
-    table = (ctypes.c_void_p * kinds**2).in_dll(library, "mjCOLLISIONFUNC")
-    entries = {
-        (_BOX, _BOX): (library.mjc_BoxBox, box_box),
-        (_CAPSULE, _MESH): (library.mjc_Convex, round_flat),
-        (_CYLINDER, _BOX): (library.mjc_Convex, round_flat),
-        (_CYLINDER, _MESH): (library.mjc_Convex, round_flat),
-        (_BOX, _MESH): (library.mjc_Convex, flat_flat),
-        (_MESH, _MESH): (library.mjc_Convex, flat_flat),
-    }
-    for (first, second), (stock, _) in entries.items():
-        if table[kinds * first + second] != ctypes.cast(stock, ctypes.c_void_p).value:
-            raise SceneError(
-                "another program has replaced MuJoCo's collision functions in this process; run "
-                "without it, or choose contact 'scene'"
-            )
-    addresses = {each: callback(each, *_C_TYPES) for each in (box_box, round_flat, flat_flat)}
-    for (first, second), (_, function) in entries.items():
-        table[kinds * first + second] = addresses[function]
+    counts = np.bincount(model.geom_type, minlength=int(mujoco.mjtGeom.mjNGEOMTYPES))
+    for first, second in _PAIRS:
+        if counts[first] and counts[second] > (first == second):
+            _install(first, second)
 
 
 def use_exact_points(model: mujoco.MjModel, *, is_used: bool = True) -> None:
@@ -351,7 +371,7 @@ def use_exact_points(model: mujoco.MjModel, *, is_used: bool = True) -> None:
         SceneError: As ``install``.
     """
     if is_used:
-        install()
+        install(model)
         model.opt.enableflags |= EXACT_POINTS
     else:
         model.opt.enableflags &= ~EXACT_POINTS
@@ -368,5 +388,5 @@ def bind_colliders(model: mujoco.MjModel) -> bool:
     """
     is_used = bool(model.opt.enableflags & EXACT_POINTS)
     if is_used:
-        install()
+        install(model)
     return is_used

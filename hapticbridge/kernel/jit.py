@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import os
+import subprocess
 import sys
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from enum import EnumType
 from functools import cache, cached_property, partial, update_wrapper
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import CodeType, FunctionType
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import llvmlite
 import mujoco
@@ -111,8 +114,9 @@ def _environment() -> str:
     """Returns the rest of what decides a function's machine code, as text."""
     numba = find_spec("numba")  # the version without an import
     assert numba is not None and numba.origin is not None
-    files = Path(numba.origin).with_name("_version.py"), Path(machine_code.__file__)
-    versions = llvmlite.__version__, mujoco.__version__, np.__version__, sys.version
+    own = Path(machine_code.__file__)
+    files = Path(numba.origin).with_name("_version.py"), own, own.with_name("whole_program.py")
+    versions = llvmlite.__version__, mujoco.__version__, np.__version__, sys.version_info[:2]
     settings = sorted(
         item
         for item in os.environ.items()
@@ -164,7 +168,7 @@ class Compiled(Deferred):
     """
 
     def __init__(self, function: Callable[..., object], *, nogil: bool) -> None:
-        super().__init__(lambda: self._decorated(is_cached=True))
+        super().__init__(self._decorated)
         update_wrapper(self, function)
         self._function, self._nogil = function, nogil
         self._direct: dict[tuple[machine_code.Kind, ...], Callable[..., Any]] = {}
@@ -174,24 +178,27 @@ class Compiled(Deferred):
         """The function in Python."""
         return self._function
 
+    def __call__(self, *arguments: object) -> Any:
+        """Calls the machine code for arguments of these types."""
+        return self.direct(arguments)(*arguments)
+
     def direct(self, arguments: tuple[object, ...]) -> Callable[..., Any]:
         """Returns the machine code for arguments of these types (``jit.direct``)."""
         found = [machine_code.kind_of(argument) for argument in arguments]
         kinds = tuple(kind for kind in found if kind is not None)
         # the linker's rules for other systems are untested
-        if len(kinds) < len(found) or self._nogil or sys.platform != "linux":
+        if len(kinds) < len(found) or sys.platform != "linux":
             return self._by_numba(arguments)
         if kinds not in self._direct:
-            self._direct[kinds] = self._loaded(kinds, arguments) or self._by_numba(arguments)
+            self._direct[kinds] = self._loaded(arguments) or self._by_numba(arguments)
         return self._direct[kinds]
 
     def callback(self, c_types: tuple[str, ...]) -> int:
         """Returns the address of a C function that calls the machine code (``jit.callback``)."""
-        arguments = tuple(0.0 if kind == "double" else 0 for kind in c_types)
+        arguments = examples(c_types)
         code = b""
         if sys.platform == "linux":
-            kinds = tuple(type(argument) for argument in arguments)
-            code = self._object_code(kinds, arguments, c_types)
+            code = self._object_code(arguments, c_types)
         return machine_code.address_of(code, self._function.__name__) if code else self._c(c_types)
 
     def _c(self, c_types: tuple[str, ...]) -> int:
@@ -209,10 +216,8 @@ class Compiled(Deferred):
     def _by_numba(self, arguments: tuple[object, ...]) -> Callable[..., Any]:
         return cast(Callable[..., Any], self.built.compile(_signature(arguments)))
 
-    def _loaded(
-        self, kinds: tuple[machine_code.Kind, ...], arguments: tuple[object, ...]
-    ) -> Callable[..., Any] | None:
-        code = self._object_code(kinds, arguments)
+    def _loaded(self, arguments: tuple[object, ...]) -> Callable[..., Any] | None:
+        code = self._object_code(arguments)
         try:
             return machine_code.load(code, self._function.__name__) if code else None
         except RuntimeError:
@@ -220,32 +225,59 @@ class Compiled(Deferred):
 
     def _object_code(
         self,
-        kinds: tuple[machine_code.Kind, ...],
         arguments: tuple[object, ...],
         c_types: tuple[str, ...] = (),
     ) -> bytes:
         """Returns the machine code on disk, compiled before if it is not there."""
-        function, types = self._function, (*map(machine_code.name_of, kinds), *c_types)
-        folder, code = cache_folder(), None
-        if folder is not None:
-            path = folder / f"{function.__name__}-{_digest(function, types)}.o"
-            code = machine_code.read(path)
+        folder, name = cache_folder(), self.file_name(arguments, c_types)
+        code = machine_code.read(READY_MADE / name)
+        if code is None and folder is not None:
+            code = machine_code.read(folder / name)
         if code is None:
-            signature = _signature(arguments)
-            dispatcher = self._decorated(is_cached=False)  # a cached one prints no code
-            dispatcher.compile(signature)
-            found, ir = dispatcher.overloads[signature], dispatcher.inspect_llvm(signature)
-            result = str(found.signature.return_type)
-            symbol = found.fndesc.llvm_func_name
-            code = machine_code.object_code(ir, symbol, kinds, result, c_types)
+            code = machine_code.object_code(self.program(arguments, c_types))
+            code = machine_code.usable(code, name)
             if folder is not None:
-                machine_code.write(path, code)
+                machine_code.write(folder / name, code)
         return code
 
-    def _decorated(self, *, is_cached: bool) -> Any:
+    def file_name(self, arguments: tuple[object, ...], c_types: tuple[str, ...] = ()) -> str:
+        """Returns the name of the file of the machine code for arguments of these types."""
+        kinds = (cast(machine_code.Kind, machine_code.kind_of(each)) for each in arguments)
+        types = *map(machine_code.name_of, kinds), *c_types
+        return f"{self._function.__name__}-{_digest(self._function, types, self._nogil)}.o"
+
+    def program(self, arguments: tuple[object, ...], c_types: tuple[str, ...] = ()) -> bytes:
+        """Returns the function with all that it calls and an entry, as LLVM's bitcode."""
+        signature = _signature(arguments)
+        with import_module("hapticbridge.kernel.whole_program").whole_program():
+            self._part.compile(signature)
+            found = self._part.overloads[signature]
+            return machine_code.program(
+                found.library.modules(),
+                found.fndesc.llvm_func_name,
+                [cast(machine_code.Kind, machine_code.kind_of(each)) for each in arguments],
+                str(found.signature.return_type),
+                c_types=c_types,
+                releases_lock=self._nogil,
+            )
+
+    @cached_property
+    def _part(self) -> Any:
+        """The function as a part of a program that is compiled as a whole."""
+        return import_module("numba").njit(
+            error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
+        )(self._function)
+
+    @property
+    def _numba_type_(self) -> Any:
+        """Type that numba sees in a caller."""
+        is_part = import_module("hapticbridge.kernel.whole_program").is_open()
+        return (self._part if is_part else self.built)._numba_type_
+
+    def _decorated(self) -> Any:
         numba = import_module("numba")
         decorate = partial(numba.njit, nogil=self._nogil, error_model="numpy")
-        folder = cache_folder() if is_cached else None
+        folder = cache_folder()
         if folder is None:
             return decorate()(self._function)
         own = folder / f"{self._function.__name__}-{_digest(self._function)}"
@@ -260,6 +292,61 @@ class Compiled(Deferred):
         is_ours = Path(function.stats.cache_path).is_relative_to(own)
         return function if is_ours else decorate()(self._function)
 
+
+def examples(c_types: tuple[str, ...]) -> tuple[object, ...]:
+    """Returns arguments of the types of a C function."""
+    return tuple(0.0 if kind == "double" else 0 for kind in c_types)
+
+
+class Program(NamedTuple):
+    """Function from ``compiled`` with examples of its arguments, or its types as a C function."""
+
+    function: Any
+    arguments: tuple[object, ...]
+    c_types: tuple[str, ...] = ()
+
+
+def prepare(programs: Sequence[Program], note: Callable[[int], None]) -> None:
+    """Compiles the programs whose machine code is not on disk, on two processors.
+
+    This process types and lowers one program while a child optimises another.
+
+    Args:
+        programs: What is to be on disk.
+        note: Called with the number of programs that are left, before each.
+    """
+    folder = cache_folder()
+    if folder is None or sys.platform != "linux":
+        return
+    missing: dict[str, Program] = {}
+    for each in programs:
+        name = each.function.file_name(each.arguments, each.c_types)
+        if not any((place / name).exists() for place in (READY_MADE, folder)):
+            missing[name] = each
+    if not missing:
+        return
+    command = [sys.executable, "-c", "from hapticbridge.kernel.machine_code import serve; serve()"]
+    with TemporaryDirectory(dir=folder) as place:
+        child = subprocess.Popen(command, stdin=subprocess.PIPE, text=True)
+        assert child.stdin is not None
+        try:
+            with suppress(BrokenPipeError), child, child.stdin:
+                for count, (name, each) in enumerate(missing.items()):
+                    note(len(missing) - count)
+                    path = Path(place, name).with_suffix(".bc")
+                    path.write_bytes(each.function.program(each.arguments, each.c_types))
+                    child.stdin.write(f"{path}\n")
+                    child.stdin.flush()
+        finally:
+            child.kill()  # of a compilation that was broken off
+        for name in missing:
+            with suppress(FileNotFoundError):  # the child was ended; compiled when it is needed
+                code = machine_code.usable(Path(place, name).read_bytes(), name)
+                machine_code.write(folder / name, code)
+
+
+READY_MADE = Path(__file__).parents[1] / "ready_made"
+"""Folder of machine code that was made with the wheel; a checkout has none."""
 
 _callbacks: list[object] = []
 """C functions that numba made, which must live until the process ends."""

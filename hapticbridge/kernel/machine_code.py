@@ -21,7 +21,7 @@ from contextlib import suppress
 from functools import cache
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import llvmlite.binding as llvm
 import numpy as np
@@ -30,9 +30,9 @@ if sys.platform != "win32":
     import grp
     import pwd
 
-Kind = type | tuple[np.dtype[Any], int]
-"""Type of an argument: ``bool``, ``int`` or ``float``; or the type of an array's items and the
-number of its axes, 0 for a record."""
+Kind: TypeAlias = "type | tuple[np.dtype[Any], int] | tuple[Kind, ...]"
+"""Type of an argument: ``bool``, ``int`` or ``float``; the type of an array's items and the number
+of its axes, 0 for a record; or the types of a tuple's items."""
 
 _ENTRY = "hapticbridge_entry"
 
@@ -68,10 +68,13 @@ _DECLARATIONS = """
 declare double @PyFloat_AsDouble(ptr)
 declare i64 @PyLong_AsLongLong(ptr)
 declare i32 @PyObject_IsTrue(ptr)
+declare ptr @PyTuple_GetItem(ptr, i64)
 declare ptr @PyBool_FromLong(i64)
 declare ptr @PyLong_FromLongLong(i64)
 declare ptr @PyFloat_FromDouble(double)
 declare void @Py_IncRef(ptr)
+declare ptr @PyEval_SaveThread()
+declare void @PyEval_RestoreThread(ptr)
 @_Py_NoneStruct = external global i8
 """
 
@@ -84,6 +87,9 @@ def kind_of(argument: object) -> Kind | None:
         return (argument.dtype, argument.ndim) if is_plain else None
     if type(argument) is np.void:
         return (argument.dtype, 0)
+    if type(argument) is tuple:
+        kinds = tuple(kind for kind in map(kind_of, argument) if kind is not None)
+        return kinds if kinds and len(kinds) == len(argument) else None
     return type(argument) if type(argument) in (bool, int, float) else None
 
 
@@ -109,47 +115,102 @@ def _machine() -> tuple[Any, Any]:
 
 @cache
 def processor() -> tuple[str, str]:
-    """Returns name and features of this processor, for which the code is made."""
-    return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    """Returns name and features of the processor for which the code is made.
+
+    That is level 3 of x86-64 if this processor has it, the baseline of 64-bit ARM, or else this
+    processor. Code that was made on another machine of that level fits. No number depends on the
+    level, because floating-point operations are never contracted or reordered.
+    """
+    name, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features()
+    machine = llvm.get_process_triple().partition("-")[0]
+    if machine == "x86_64" and all(features.get(each) for each in _LEVEL_3):
+        return "x86-64-v3", ""
+    return ("generic", "") if machine == "aarch64" else (name, features.flatten())
 
 
-def object_code(
-    ir: str, symbol: str, kinds: Sequence[Kind], result: str, c_types: Sequence[str] = ()
+_LEVEL_3 = ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "sse4.2", "popcnt")
+"""Features of the third level of x86-64, as LLVM names them."""
+
+
+def program(
+    parts: Sequence[Any],
+    symbol: str,
+    kinds: Sequence[Kind],
+    result: str,
+    *,
+    c_types: Sequence[str] = (),
+    releases_lock: bool = False,
 ) -> bytes:
-    """Compiles a function's optimised code together with an entry.
+    """Links a function with all that it calls and an entry.
 
     Args:
-        ir: LLVM code of the function and all that it calls, as numba prints it.
+        parts: LLVM modules of the function and all that it calls, not optimised.
         symbol: Name of the function there.
         kinds: Types of the arguments.
         result: numba's name of the result's type.
         c_types: If given, LLVM's types of the arguments of a C function that returns an ``int``;
             the entry is then that function. Otherwise it takes Python objects.
+        releases_lock: True to release the interpreter lock in calls from Python.
 
     Returns:
-        The object code, empty if it cannot be used without numba's runtime.
+        LLVM's bitcode, empty if there is no entry for it.
     """
     if result not in _RESULTS:
         return b""
     target, _ = _machine()
+    entry = _c_entry(symbol, c_types) if c_types else _entry(symbol, kinds, result, releases_lock)
     try:
-        module = llvm.parse_assembly(ir)
-        entry = _c_entry(symbol, c_types) if c_types else _entry(symbol, kinds, result)
-        module.link_in(llvm.parse_assembly(entry))
-        for value in (*module.functions, *module.global_variables):
-            if not value.is_declaration and value.name != _ENTRY:
-                value.linkage = "internal"
-        passes = llvm.create_new_module_pass_manager()
-        passes.add_global_dead_code_eliminate_pass()
-        passes.run(module, llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options()))
-        code = bytes(target.emit_object(module))
-        address_of(code, symbol)
+        module = llvm.parse_assembly(entry)
+        module.triple, module.data_layout = target.triple, str(target.target_data)
+        for part in parts:
+            module.link_in(part, preserve=True)
+    except RuntimeError:  # with an LLVM whose pointers have types
+        return b""
+    for value in (*module.functions, *module.global_variables):
+        if not value.is_declaration and value.name != _ENTRY:
+            value.linkage = "internal"
+    return bytes(module.as_bitcode())
+
+
+def object_code(bitcode: bytes) -> bytes:
+    """Optimises and compiles a program, at LLVM's level 3 as numba does.
+
+    Returns:
+        The object code, empty if it cannot be used without numba's runtime.
+    """
+    if not bitcode:
+        return b""
+    target, _ = _machine()
+    try:
+        module = llvm.parse_bitcode(bitcode)
+        options = llvm.create_pipeline_tuning_options(3)
+        options.loop_vectorization, options.slp_vectorization = True, False
+        builder = llvm.create_pass_builder(target, options)
+        passes = builder.getModulePassManager()
+        passes.add_refprune_pass()
+        passes.run(module, builder)
+        return bytes(target.emit_object(module))
     except (RuntimeError, AttributeError):  # the latter with an llvmlite that lacks such a pass
+        return b""
+
+
+def usable(code: bytes, name: str) -> bytes:
+    """Returns the code, or none if the linker refuses it."""
+    try:
+        address_of(code, name)
+    except RuntimeError:
         return b""
     return code
 
 
-def _entry(symbol: str, kinds: Sequence[Kind], result: str) -> str:
+def serve() -> None:
+    """Compiles the programs in the files named on standard input, each into a file beside it."""
+    for line in sys.stdin:
+        path = Path(line.rstrip("\n"))
+        path.with_suffix(".o").write_bytes(object_code(path.read_bytes()))
+
+
+def _entry(symbol: str, kinds: Sequence[Kind], result: str, releases_lock: bool) -> str:
     """Returns LLVM code that calls a function of numba with Python objects.
 
     The function takes places for its result and for an exception, and returns 0 without one. NULL
@@ -168,13 +229,17 @@ def _entry(symbol: str, kinds: Sequence[Kind], result: str) -> str:
     place, give = _RESULTS[result]
     types = ", ".join(value.split()[0] for value in passed)
     body = "\n".join(lines)
+    release = "%thread = call ptr @PyEval_SaveThread()" if releases_lock else ""
+    regain = "call void @PyEval_RestoreThread(ptr %thread)" if releases_lock else ""
     return f"""{_DECLARATIONS}
 declare i32 @"{symbol}"({types})
 define ptr @{_ENTRY}(ptr %self, ptr %arguments, i64 %count) {{
 %place = alloca {place}
 %exception = alloca ptr
 {body}
+{release}
 %status = call i32 @"{symbol}"({", ".join(passed)})
+{regain}
 %failed = icmp ne i32 %status, 0
 br i1 %failed, label %fail, label %done
 fail:
@@ -222,6 +287,13 @@ def _unpacked(a: str, kind: Kind) -> tuple[list[str], list[str]]:
     if isinstance(kind, type):
         lines = [f"{a}.truth = call i32 @PyObject_IsTrue(ptr {a})"]
         return [*lines, f"{a}.value = trunc i32 {a}.truth to i8"], [f"i8 {a}.value"]
+    if not isinstance(kind[0], np.dtype):
+        lines, values = list[str](), list[str]()
+        for number, each in enumerate(kind):
+            code, parts = _unpacked(f"{a}.{number}", each)
+            lines += (f"{a}.{number} = call ptr @PyTuple_GetItem(ptr {a}, i64 {number})", *code)
+            values += parts
+        return lines, values
     dtype, axes = kind
     offset = _HEADER if axes else _HEADER + 8
     lines = [

@@ -1,8 +1,11 @@
 """Processor time that commands take to start, relative to that of the libraries.
 
 One line per command: the median of user and system time, child processes included, over that of a
-process that imports numpy, mujoco, numba and rich. Byte code goes to a folder of its own; the
-first start on a machine compiles for longer.
+process that imports numpy, mujoco, numba and rich. Byte code goes to a folder of its own.
+
+``--cold`` measures the first start on a machine instead, with an empty folder of machine code: what
+``scripts/setup`` compiles, then the first run and its audit. Each line has the time of processor
+and clock, and the files of machine code after it.
 """
 
 from __future__ import annotations
@@ -11,7 +14,9 @@ import argparse
 import os
 import subprocess
 import sys
+import time
 from functools import partial
+from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -44,12 +49,36 @@ def processor_time(arguments: list[str], environment: dict[str, str]) -> float:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Adds the number of passes."""
+    """Adds the number of passes, and the choice of the first start."""
     parser.add_argument("--passes", type=whole, default=7, help="runs of each command")
+    parser.add_argument("--cold", action="store_true", help="the first start on a machine instead")
+
+
+def measure_cold() -> dict[str, float]:
+    """Prints the first start on a machine, step by step; returns processor times in s."""
+    found: dict[str, float] = {}
+    with TemporaryDirectory() as folder:
+        environment = os.environ | {"NUMBA_CACHE_DIR": folder}
+        recording = str(Path(folder, "run.mcap"))
+        steps = {
+            "setup": ["-m", "hapticbridge.run.programs"],
+            "first_run": [*COMMANDS["run"], "--record", recording],
+            "first_audit": ["-m", "hapticbridge", "audit", recording],
+        }
+        for name, arguments in steps.items():
+            start = time.monotonic()
+            found[name] = processor_time(arguments, environment)
+            passed = time.monotonic() - start
+            sizes = [path.stat().st_size for path in Path(folder, "machine_code").rglob("*.*")]
+            size = f"{len(sizes)} files, {sum(sizes) / 1e6:.2f} MB"
+            print(f"{name} {found[name]:.1f} s, by the clock {passed:.1f} s; {size}")
+    return found
 
 
 def measure(options: argparse.Namespace) -> dict[str, float]:
     """Prints the time of each command; returns the times in s."""
+    if options.cold:
+        return measure_cold()
     with TemporaryDirectory() as folder:
         environment = os.environ | {"PYTHONPYCACHEPREFIX": folder}
         environment.pop("PYTHONDONTWRITEBYTECODE", None)
