@@ -247,19 +247,25 @@ class Compiled(Deferred):
         return f"{self._function.__name__}-{_digest(self._function, types, self._nogil)}.o"
 
     def program(self, arguments: tuple[object, ...], c_types: tuple[str, ...] = ()) -> bytes:
-        """Returns the function with all that it calls and an entry, as LLVM's bitcode."""
+        """Returns the function with all that it calls and an entry, as LLVM's bitcode.
+
+        It is empty if numba must compile the function for itself.
+        """
         signature = _signature(arguments)
-        with import_module("hapticbridge.kernel.whole_program").whole_program():
-            self._part.compile(signature)
-            found = self._part.overloads[signature]
-            return machine_code.program(
-                found.library.modules(),
-                found.fndesc.llvm_func_name,
-                [cast(machine_code.Kind, machine_code.kind_of(each)) for each in arguments],
-                str(found.signature.return_type),
-                c_types=c_types,
-                releases_lock=self._nogil,
-            )
+        try:
+            with import_module("hapticbridge.kernel.whole_program").whole_program():
+                self._part.compile(signature)
+                found = self._part.overloads[signature]
+                return machine_code.program(
+                    found.library.modules(),
+                    found.fndesc.llvm_func_name,
+                    [cast(machine_code.Kind, machine_code.kind_of(each)) for each in arguments],
+                    str(found.signature.return_type),
+                    c_types=c_types,
+                    releases_lock=self._nogil,
+                )
+        except (ImportError, AttributeError):  # with a numba whose inner parts are others
+            return b""
 
     @cached_property
     def _part(self) -> Any:
@@ -326,19 +332,21 @@ def prepare(programs: Sequence[Program], note: Callable[[int], None]) -> None:
     if not missing:
         return
     command = [sys.executable, "-c", "from hapticbridge.kernel.machine_code import serve; serve()"]
-    with TemporaryDirectory(dir=folder) as place:
-        child = subprocess.Popen(command, stdin=subprocess.PIPE, text=True)
+    with TemporaryDirectory(dir=folder) as place, suppress(OSError):  # no child, or it was ended
+        # in a session of its own: Ctrl-C reaches this process, which ends the child
+        child = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True)
         assert child.stdin is not None
-        try:
-            with suppress(BrokenPipeError), child, child.stdin:
+        with child:
+            try:
                 for count, (name, each) in enumerate(missing.items()):
                     note(len(missing) - count)
                     path = Path(place, name).with_suffix(".bc")
                     path.write_bytes(each.function.program(each.arguments, each.c_types))
                     child.stdin.write(f"{path}\n")
                     child.stdin.flush()
-        finally:
-            child.kill()  # of a compilation that was broken off
+            except BaseException:
+                child.kill()
+                raise
         for name in missing:
             with suppress(FileNotFoundError):  # the child was ended; compiled when it is needed
                 code = machine_code.usable(Path(place, name).read_bytes(), name)
