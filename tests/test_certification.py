@@ -16,8 +16,10 @@ from cli_cases import Called
 from hapticbridge import Coupling
 from hapticbridge.audit import audit
 from hapticbridge.audit.events import AuditedRun
+from hapticbridge.cli import zwidth
 from hapticbridge.demand.certification import Standing
 from hapticbridge.device import SimulatedDevice
+from hapticbridge.device.profile import Profile, Quantity
 from hapticbridge.recording import read_recording
 from hapticbridge.theory.bounds import late_minimum_damping
 
@@ -63,6 +65,36 @@ def test_a_late_device_that_lacks_damping_is_told_the_number_of_its_own_bound(
     assert report.certified is False
     assert "b < what its delay needs: 2 < " in report.reason
     assert "KT/2" not in report.reason
+
+
+@pytest.mark.parametrize("is_measured", [False, True])
+def test_a_certificate_names_a_delay_that_is_stated_and_was_not_measured(
+    is_measured: bool, tmp_path: Path, call: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    profile = Profile(
+        name="own",
+        device="own",
+        serial="",
+        axes=None,
+        about="",
+        quantities={"delay": Quantity(0.0, "a test", (0.0, 1e-5) if is_measured else None)},
+    )
+    unknown = replace(SimulatedDevice().info, delay=None, is_delay_measured=False)
+    sheet, path = profile.fill(unknown), tmp_path / "run.mcap"
+    assert sheet.delay == 0.0
+    device = ScriptedDevice(sway, is_delay_measured=sheet.is_delay_measured)
+    summary, clause = recorded(path, "point_mass", device, duration=0.1), ", if its forces come"
+    report = audit(path)
+    assert report.certification is not None
+    for found in (summary.certification, report.certification):
+        assert found.standing is Standing.CERTIFIED
+        said = [clause in text for text in (found.words, found.fact, found.note)]
+        assert said == [not is_measured] * 3
+    opened = SimulatedDevice()
+    opened.info = sheet
+    monkeypatch.setattr(zwidth, "open_device", lambda _spec, notify: opened)
+    told = call("bound", "--stiffness", 2400, "--damping", 1.7, "--device", "simulated")
+    assert (told[0], clause in told[1]) == (0, not is_measured)
 
 
 def test_the_most_demanding_coupling_of_a_run_counts_its_friction_too(tmp_path: Path) -> None:

@@ -13,10 +13,7 @@ from hapticbridge.arguments import Arguments, option, shared
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress, write_figure
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
-from hapticbridge.demand.certificate import (
-    DampingCondition,
-    conditions_of,
-)
+from hapticbridge.demand.certificate import IF_TIMELY, DampingCondition, conditions_of
 from hapticbridge.demand.loop_setting import (
     IN_TIME,
     Lag,
@@ -333,7 +330,7 @@ class Bound:
         if self.as_json:
             print_json(
                 {
-                    "needed": ways[0].needed,
+                    "needed": ways[0].needed if condition is None else condition.needed,
                     "frequency_hz": _hertz(ways[0]),
                     "holds": holds,
                     "method": default_method().name,
@@ -347,7 +344,8 @@ class Bound:
                 }
             )
         else:
-            self._print(ways, shown, period, b, holds=holds)
+            is_stated = condition is not None and condition.is_delay_stated
+            self._print(ways, shown, period, b, limit=f", {IF_TIMELY}" * is_stated, holds=holds)
             if condition is not None and (b is None or condition.steps is not None):
                 out.print(plain(condition.sentence()))
         if self.plot is not None:
@@ -388,6 +386,7 @@ class Bound:
         period: float,
         b: float | None,
         *,
+        limit: str,
         holds: bool | None,
     ) -> None:
         method = default_method()
@@ -405,8 +404,8 @@ class Bound:
         least = method.compensated_share * self.stiffness * period
         if self.device is None:
             out.print(
-                "a delay of the device is not in it: --device counts it, and 'zwidth --delay' has "
-                "the limit at a wall"
+                "a delay of the device is not in it: --device counts it, for every scene, and "
+                "'zwidth --delay' has the couplings that it allows"
             )
         if self.damping < least:
             out.print(
@@ -418,7 +417,7 @@ class Bound:
         needed = ways[0].needed
         if b >= needed:
             but = "" if holds else " but for its encoder's steps"
-            out.print(f"device damping {b:g} >= {needed:g} N s/m: passive in any hand{but}")
+            out.print(f"device damping {b:g} >= {needed:g} N s/m: passive in any hand{limit}{but}")
             if not holds:
                 return
             out.print(

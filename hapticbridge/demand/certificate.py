@@ -196,6 +196,10 @@ class StepCondition:
         return text if self.holds else f"{text}; {self.remedy}"
 
 
+IF_TIMELY = "if its forces come within the tick"
+"""Limit of a certificate for a delay of 0 that the device states and no measurement confirms."""
+
+
 @dataclass(frozen=True, slots=True)
 class DampingCondition:
     """The device condition on one kind of axis: b >= scale · force_scale · (K T/2 + B'), in time.
@@ -210,6 +214,7 @@ class DampingCondition:
         tick: Length of such a tick in s.
         ticks_per_sample: Ticks for which one force is held, 1 at best.
         steps: Condition on the encoder's steps along this kind of axis; None without one.
+        is_delay_stated: True if no measurement confirms the delay.
         is_felt: False for axes that are sensed without a motor. The hand puts energy into the scene
             there without work of its own, so no damping bounds what it gets back along the axes
             with a motor (Barbagli & Salisbury 2003).
@@ -223,6 +228,7 @@ class DampingCondition:
     tick: float = 0.0
     ticks_per_sample: int = 1
     steps: StepCondition | None = None
+    is_delay_stated: bool = False
     is_felt: bool = True
 
     @property
@@ -279,6 +285,8 @@ class DampingCondition:
             late = format_si(self.delay * self.tick, "s")
             ticks = "1 tick" if self.delay == 1 else f"{self.delay} ticks"
             text = f"{text} with its delay of {late} ({ticks}), for which no proof is built in yet"
+        elif self.is_delay_stated:
+            text = f"{text}, {IF_TIMELY}"
         return text if self.steps is None else f"{text}; {self.steps.sentence()}"
 
 
@@ -315,6 +323,7 @@ def _condition(loop: LoopSetting, axis: Axis, available: float | None) -> Dampin
         loop.period,
         loop.lag.ticks_per_sample,
         _steps(loop) if axis == "translation" else None,
+        not loop.info.is_delay_measured,
     )
 
 

@@ -7,7 +7,12 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any
 
-from hapticbridge.demand.certificate import DampingCondition, is_run_certified, run_conditions
+from hapticbridge.demand.certificate import (
+    IF_TIMELY,
+    DampingCondition,
+    is_run_certified,
+    run_conditions,
+)
 from hapticbridge.demand.methods import Method
 from hapticbridge.demand.timekeeping import NOT_KEPT, RunTimes, Timekeeping
 from hapticbridge.device import DeviceInfo
@@ -121,7 +126,7 @@ class Certification:
             unknown = any(each.holds is None for each in steps)
             limits = "; its encoder's steps are not judged" if unknown else ""
             limits += f", but {self.energy.limit}" if self.energy.limit else ""
-            return f"device certified{self.kept.clause}: b >= {self._bound}{limits}"
+            return f"device certified{self.kept.clause}: b >= {self._bound}{self._if}{limits}"
         if self.verdict is None:
             return f"device not judged: {_OPEN[self.standing]}{self.kept.slowness}"
         return f"device not certified: {self._cause}"
@@ -160,12 +165,18 @@ class Certification:
         return "KT/2 + B_law" if count == 1 else f"what {count} substeps need"
 
     @property
+    def _if(self) -> str:
+        """Clause on a delay that no measurement confirms."""
+        is_stated = any(each.is_delay_stated for each in self.conditions)
+        return f", {IF_TIMELY}" if is_stated else ""
+
+    @property
     def fact(self) -> str:
         """Verdict as a value in a table of facts."""
         if self.verdict is None:
             return "not judged"
         if self.verdict:
-            return f"bears the coupling{self.kept.clause}"
+            return f"bears the coupling{self.kept.clause}{self._if}"
         return "does not bear it" if self.standing in _BY_CONDITION else self._cause
 
     @property
@@ -173,6 +184,7 @@ class Certification:
         """Sentence for a reader of a passive run's page."""
         if self.verdict:
             clause = f",{self.kept.clause}" if self.kept.clause else ""
+            clause += self._if
             limit = f"; but {self.energy.limit}" if self.energy.limit else ""
             return f"The device bears this coupling, in any hand{clause}{limit}."
         if self.standing is Standing.NO_HAND:

@@ -191,6 +191,8 @@ class DeviceInfo:
         rate: The device's own rate in Hz, > 0; None if it follows the bridge.
         delay: Age of a sample when the loop reads it, plus the time until a written wrench acts, in
             s, >= 0; None if unknown.
+        is_delay_measured: True if ``delay`` was measured, as 'hapticbridge identify' does, or is
+            exact, as in a simulation; a certificate names a delay that is a statement alone.
         is_prescribed: True if the motion does not react to force.
         is_real: True if motors act on a person's hand. The default is the safe one: such a device
             runs on a real clock only, and waits for the hand to be still.
@@ -221,6 +223,7 @@ class DeviceInfo:
     speed_limit: float = option(USUAL_SPEED_LIMIT, unit="m/s", least=0.0)
     rate: float | None = option(None, unit="Hz", least=0.0, is_open=True)
     delay: float | None = option(None, unit="s", least=0.0)
+    is_delay_measured: bool = False
     is_prescribed: bool = False
     is_real: bool = True
     duration: float | None = option(None, unit="s", least=0.0)

@@ -116,6 +116,8 @@ class Profile:
                 value = max(quantity.interval[0], 0.0)
             if before is None:
                 known[name] = value
+                if name == "delay":
+                    known["is_delay_measured"] = quantity.interval is not None
             elif name.endswith("_limit"):
                 known[name] = min(before, value)
         return dataclasses.replace(info, **known)

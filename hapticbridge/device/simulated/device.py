@@ -207,6 +207,7 @@ class SimulatedDevice:
             torque_limit=torque_limit,
             speed_limit=speed_limit,
             delay=None if delay else 0.0,  # in samples, so its time is not known yet
+            is_delay_measured=True,
             is_real=False,
             duration=duration,
             buttons=0,
