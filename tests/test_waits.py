@@ -41,6 +41,7 @@ REASONS = {
     "identify/identify.py: clock.wait()": "a clock's: at most one period",
     "identify/z_width.py: self.clock.wait()": "a clock's: at most one period",
     "realtime/doctor.py: wait()": "a clock's: at most one period",
+    "kernel/machine_code.py: for line in sys.stdin": "the end of the process that asks closes it",
     # devices and their guardian
     "device/transport/hid.py: self._wake.wait()": f"{DAEMON} longer than LONGEST_WRITE",
     "device/rawhid/serial.py: self._ports.sleep(PAUSE)": "until the time of its caller is over",
