@@ -368,8 +368,37 @@ def test_a_light_hand_that_slams_on_a_device_1_ms_late_is_found(tmp_path: Path) 
     assert "the device swung: it answered late" in report.reason
     assert report.resimulation == "bit for bit"
     force = hb.read_recording(path).ticks["wrench_on_device"][:, 0]
-    assert np.abs(force[:1200]).max() == 10.0
+    assert np.abs(force[:1200]).max() >= 5.0
     assert np.abs(force[1500:]).max() <= 3.0
+
+
+@pytest.mark.parametrize(
+    ("hand", "push", "delay"),
+    [
+        ((0.028, 3.2, 11.5), 4.9, 2),
+        ((0.0088, 2.7, 5.3), 3.8, 2),
+        ((0.010, 0.9, 85.0), 5.0, 1),
+        ((0.025, 1.0, 0.5), 2.5, 1),
+        ((0.050, 0.5, 18.0), 2.5, 1),
+        ((0.050, 0.05, 350.0), 2.5, 2),
+    ],
+)
+def test_a_hand_that_is_pushed_on_by_late_forces_is_found_and_rests(
+    hand: tuple[float, float, float], push: float, delay: int
+) -> None:
+    """It swings at 34 to 73 Hz with 1.5 to 2.5 N for ever, and takes up to 0.6 W; no wall would."""
+    mass, damping, stiffness = hand
+    held = Hand(mass=mass - 0.005, damping=damping, stiffness=stiffness)
+    path = Motion([0.0, 1.0, 99.0], [(x, 0.0, 0.0) for x in (0.0, *2 * (push / stiffness,))])
+    forces = []
+    for ticks in (delay, 0):
+        device = SimulatedDevice(mass=0.005, hand=held, path=path, delay=ticks)
+        device.info = replace(device.info, delay=0.0)
+        with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock()) as bridge:
+            summary = bridge.run(6.0)
+            forces.append(bridge.latest_records(1000)["wrench_on_device"][:, 0].std())
+        assert summary.is_certified is (ticks == 0)
+    assert max(forces) <= 0.3
 
 
 def test_a_light_hand_is_no_alarm_if_the_force_comes_in_time(tmp_path: Path) -> None:

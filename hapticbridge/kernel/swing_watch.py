@@ -34,9 +34,9 @@ Findings, for translation and rotation each; E is 8 mJ at a limit of 10 N or 0.5
     ms without a stated delay, with E_s >= E for 40 ms; or c <= 0 and p < 0.6 with c_s >= 0.4 for 12
     ms. The greatest ratio r of the lever between device and handle is halved, hence the stiffness
     quartered; again for each E_s >= E.
-    slammed: √(Σ W²/0.1 s) >= 0.3 of the limit, Σ W² >= 0.9 of that above 4 Hz, and Σ W·V <= b Σ
-    V²/2, for 0.3 s. r is halved. No hand swings so fast, and a passive scene drives no such swing
-    of a device that takes what its damping burns. A motor or a texture of the scene gives more.
+    slammed: Σ W² >= 0.9 of that above 4 Hz, Σ W·V <= b Σ V²/2, and b Σ V² − Σ W·V is 3 mW or more
+    at a limit of 10 N or 0.5 N m, for 0.3 s and until 8 mJ are missing. r is halved. No hand swings
+    so fast, so b Σ V² comes from the force, and it came late. Of an unknown damping b = 0 counts.
     coarse: 3 steps within 0.3 s. r is halved. A step is a new sample that follows equal ones of 4
     ms and more, and over which the coupling pulls with half the limit, r K ‖δp‖ >= F/2.
 
@@ -69,14 +69,11 @@ in a rattling peg is taken for a fault. A hand that yields to torque as its own 
 swing has p = 0.9, c = −0.04, x > 0.6 and c_s = 0.76; faults have p < 0.6. They reach p = −0.95, c =
 −0.99, x = 0.99 and c_s = 0.9. Work alone cannot tell them apart: E_s of a firm hand is up to 200 E.
 
-Slams, of 15 to 80 g on a device 1 or 2 ms late, have 0.6 to 0.7 of the limit at 50 to 70 Hz. Honest
-hands, textures and light devices reach 0.2 for 0.3 s.
-
 Steps of 4 mm swing between two samples 40 to 90 times a second and give at most 17 mJ. A device
 that starts from rest moves by 0.1 mm in a tick of 1 ms: 10 N on 0.05 kg.
 
-Limits of the method: a slam gives up to 0.9 J before it is found, and one below 0.3 of the limit up
-to 0.04 W for as long as it lasts. A motor that holds for 60 ms gives two fingers up to 0.4 J within
+Limits of the method: a slam gives up to 0.1 J before it is found, and a smaller one some mW for as
+long as it lasts. A motor that holds for 60 ms gives two fingers up to 0.4 J within
 one hold, before a lower force could reach it, and 0.8 J where two throws were needed. A torque 12
 to 20 ms late gives two fingers up to 0.5 J within the throw in which it is found. A torque 2 ms
 later than its device states gives them up to 0.7 J. If a device states no delay, a force 2 ms late
@@ -151,10 +148,10 @@ STEPS, STEP = 3.0, 0.5
 """Number of steps for a finding, and the least share of the limit that a step is worth; no unit. A
 lower share takes steps of 0.2 mm at 2400 N/m and a limit of 2 N, which can be felt, for a fault."""
 
-SLAM, PURE = 0.3, 0.9
-"""Least RMS value of a slam as a share of the limit, and least Σ W² as a share of that above
+SLAM, PURE = 0.4, 0.9
+"""Least missing power of a slam in E per s, and least Σ W² as a share of that above
 ``SLOWEST``; no unit. A swing of 25 Hz has the share 0.9, the shaking of a hand at 11 Hz up to 0.2.
-A lower ``SLAM`` finds smaller swings, and takes rattles of a weak device for slams."""
+A lower ``SLAM`` finds smaller swings. Steps of an encoder of 0.2 mm seem to burn 0.1 E per s."""
 
 ANSWERS, STRIDE = 6, 2
 """Number of lags of c_s, and blocks from one to the next: 8, 16 to 48 ms. A motor that holds for 60
@@ -229,6 +226,8 @@ WATCH_DTYPE = np.dtype(
         ("fast_speed", "<f8", 6),
         ("mean_wrench", "<f8", 3),
         ("change", "<f8", 3),
+        ("known_damping", "<f8", 2),
+        ("lacking", "<f8", 2),
         ("swing_square", "<f8", 2),
         ("wrench_square", "<f8", 2),
         ("speed_square", "<f8", 2),
@@ -263,7 +262,8 @@ N m, ``late_energy`` E in J. ``cap`` is the greatest ratio after all findings, `
 allowed now, ``returns_to`` the ratio before a probe; ``probe_end`` and ``rest_end`` in blocks.
 ``wrench`` and ``motion`` are sums over the block. ``wrench_square`` to ``across`` are the sums over
 W and A, ``whole_square`` that of all acceleration; ``believed`` and ``delayed`` are E_0 and E_s;
-``swing_square`` is Σ W² above 4 Hz; ``late_along`` are the sums over W_{k−s}·A, and ``past_means``
+``swing_square`` is Σ W² above 4 Hz, ``known_damping`` b or 0, and ``lacking`` what a slam lacks in
+J; ``late_along`` are the sums over W_{k−s}·A, and ``past_means``
 and ``past_squares`` rings of W and Σ W². ``still`` counts the equal samples before this one, and
 ``steps`` the coarse steps of late; ``counts`` are blocks in a row of late, reversed, exchanged,
 answered late, τ_0 and slams. ``stray`` is the way from where the handle stands, ``step`` the one
@@ -296,6 +296,10 @@ def bind_watch(watch: Part, parameters: RunParameters) -> None:
     )
     watch["stand_ticks"] = round(STAND / period)
     watch["push"] = np.maximum(PUSH, PUSH_SHARE * watch["limits"])
+    watch["known_damping"] = (
+        parameters.device_damping or 0.0,
+        parameters.device_rotational_damping or 0.0,
+    )
 
 
 def _butterworth(corner: float) -> list[float]:
@@ -590,10 +594,18 @@ def _is_slammed(s: State, kind: int) -> bool:
         square += slow_wrench * slow_wrench
     swing = watch.kept[0] * watch.swing_square[kind] + watch.block * square
     watch.swing_square[kind] = swing
-    slam = FAST_MEMORY * (SLAM * watch.limits[kind] * watch.cap) ** 2
-    burnt = _damping(s, kind) * watch.speed_square[kind]
-    is_fast = watch.wrench_square[kind] >= max(slam, PURE * swing) and slam > 0.0
-    return bool(is_fast and watch.power[kind] <= 0.5 * burnt)
+    enough = watch.late_energy[kind] * watch.cap
+    burnt = watch.known_damping[kind] * watch.speed_square[kind]
+    taken = watch.power[kind] + watch.stated_delay * max(watch.along[kind], 0.0)
+    power = (burnt - taken) / FAST_MEMORY
+    is_pure = watch.wrench_square[kind] >= PURE * swing and taken <= 0.5 * burnt
+    if is_pure and power >= SLAM * enough and enough > 0.0:
+        watch.lacking[kind] += watch.block * power
+        watch.counts[6 * kind + 5] += 1
+    else:
+        watch.lacking[kind] = watch.counts[6 * kind + 5] = 0
+    is_long = watch.counts[6 * kind + 5] >= watch.ring_blocks
+    return bool(is_long and watch.lacking[kind] >= enough)
 
 
 @compiled
@@ -635,13 +647,13 @@ def _verdict(s: State, kind: int) -> int:
     is_answered = is_answered and _late_answer(watch, kind, least) >= ANSWERED
     is_answered = is_answered and watch.blocks >= watch.rings_end[kind]
     counts[at + 3] = counts[at + 3] + 1 if is_answered else 0
-    counts[at + 5] = counts[at + 5] + 1 if _is_slammed(s, kind) else 0
+    is_slammed = _is_slammed(s, kind)
     if counts[at + 1] >= BLOCKS or counts[at + 2] >= BLOCKS:
         return RUNS_AWAY
     has_swung = watch.flags & SWINGING != 0
     is_coarse = watch.steps[kind] >= STEPS
     is_found = max(counts[at], counts[at + 3]) >= BLOCKS or counts[at + 4] >= DELAY_BLOCKS
-    is_found = is_found or counts[at + 5] >= watch.ring_blocks
+    is_found = is_found or is_slammed
     if is_coarse or is_found or (has_swung and is_working):
         return SWINGING
     is_suspicious = late >= MUCH * enough or watch.gained[kind] >= watch.gain[kind]
