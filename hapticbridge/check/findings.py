@@ -33,9 +33,6 @@ from hapticbridge.scene.compile import START_KEYFRAME
 
 # Faults of options, start, and motion without a hand
 
-_OWN_FAULT = "integrator:", "solver:", "start where"  # changes with a fault of their own
-
-
 _SAME_STEP = 1e-9  # relative: 0.001 as 1/1000
 
 
@@ -43,7 +40,7 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields a time step that is not the run's, and concerns from loading the scene.
 
     Integrator, solver and flags that a run needs are set when the scene is loaded
-    (``Scene.changes``), so that they are no faults.
+    (``Scene.differences``), so that they are no faults.
     """
     option, places = case.source.spec.option, case.places
     step = float(option.timestep)
@@ -57,8 +54,8 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             f"{1 / step:g}",
             is_note=True,
         )
-    for change in case.scene.changes:
-        if not change.startswith(_OWN_FAULT):
+    for change in case.scene.differences:
+        if not change.kind:  # those of a kind have a fault of their own
             yield Fault(
                 "changed",
                 places.option("integrator"),

@@ -48,7 +48,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.errors import SceneError
+from hapticbridge.errors import SceneError, SceneWarning
+from hapticbridge.scene.compile import SceneChange
 
 STRICT_STEPS = 60.0
 """τ/h above which a contact of moderate stiffness created no energy in any run of the map (its
@@ -180,7 +181,7 @@ SOFT_FREQUENCY = 15.0
 holds at 24 Hz. A hand moves at up to 10 Hz, and would feel a softer one yield."""
 
 
-def announce_soft_equalities(model: mujoco.MjModel) -> tuple[str, ...]:
+def announce_soft_equalities(model: mujoco.MjModel) -> tuple[SceneChange, ...]:
     """Returns a sentence on equality constraints that rigid ones replace, as ``name: old → new``.
 
     An equality holds a mass with ω² = κ/h² (κ of the module's first equation), so softly below
@@ -199,10 +200,11 @@ def announce_soft_equalities(model: mujoco.MjModel) -> tuple[str, ...]:
     if not names:
         return ()
     more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-    return (
+    words = (
         f"equality '{names[0]}'{more}: a spring of {slowest:.2g} Hz → rigid (--contact scene keeps "
-        "it, and may then create energy)",
+        "it, and may then create energy)"
     )
+    return (SceneChange(words),)
 
 
 def impedance_at(solimp: Sequence[float], depth: float) -> float:
@@ -375,7 +377,7 @@ class _GeomSetting(NamedTuple):
 def warn_of_contacts(model: mujoco.MjModel, grip: str, scene: object) -> None:
     """Warns of contacts that are likely to create more energy than the slack allows."""
     for concern in check_contacts(model, grip):
-        warnings.warn(f"scene '{scene}': {concern}", UserWarning, stacklevel=3)
+        warnings.warn(SceneWarning(scene, str(concern)), stacklevel=3)
 
 
 def check_contacts(

@@ -14,7 +14,13 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from hapticbridge.device.base import calling_on_error
-from hapticbridge.device.driver import Driver, FoundDevice, access_problem, is_refused, select_device
+from hapticbridge.device.driver import (
+    Driver,
+    FoundDevice,
+    access_problem,
+    is_refused,
+    select_device,
+)
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.transport.usb import members, on_the_bus
 from hapticbridge.errors import DeviceError, DeviceLost

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,13 @@ import usb.backend.libusb1 as pyusb
 import usb.core
 import usb.util
 
-from hapticbridge.device.driver import Driver, FoundDevice, access_problem, is_refused, permission_problem
+from hapticbridge.device.driver import (
+    Driver,
+    FoundDevice,
+    access_problem,
+    is_refused,
+    permission_problem,
+)
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.errors import DeviceError, DeviceLost
 
@@ -92,9 +98,7 @@ def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
     return found
 
 
-def members(
-    driver: Driver, devices: Iterable[OnTheBus], problem: str | None
-) -> list[FoundDevice]:
+def members(driver: Driver, devices: Iterable[OnTheBus], problem: str | None) -> list[FoundDevice]:
     """Returns the devices of a driver; ``problem`` says why none can be opened, if none can."""
     return [
         FoundDevice(
