@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,7 +19,7 @@ from hapticbridge.scene import read_scene, scene_names, scene_path
 from hapticbridge.scene.contacts import meeting_pairs
 
 
-def inventory_of(scene: Path, **options: object) -> Inventory:
+def inventory_of(scene: Path, **options: Any) -> Inventory:
     return inventory_in(case_of(scene, **options))
 
 

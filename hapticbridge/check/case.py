@@ -230,16 +230,35 @@ class SceneUnderCheck(CompiledScene):
         return default_method().law_coupling(self.coupling, self.period)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IntendedUse:
+    """Device and run for which a scene is checked.
+
+    Attributes:
+        coupling: Requested K and B; None takes the default of the simulated device.
+        period: T in s; None takes ``DEFAULT_PERIOD``.
+        scale: Handle motion per device motion.
+        workspace: Edge in m of the cube that the device reaches, > 0.
+        contact: Contact of the run: ``rigid``, its default, or ``scene``, MuJoCo's own.
+    """
+
+    coupling: Coupling | None = None
+    period: float | None = None
+    scale: float = 1.0
+    workspace: float = LARGEST_WORKSPACE
+    contact: Literal["rigid", "scene"] = "rigid"
+
+
+DEFAULT_USE = IntendedUse()
+"""Default run on the largest table-top device."""
+
+
 def open_case(
     source: SceneSource,
     grip: str = "grip",
+    use: IntendedUse = DEFAULT_USE,
     *,
-    coupling: Coupling | None = None,
-    period: float | None = None,
-    scale: float = 1.0,
-    workspace: float = LARGEST_WORKSPACE,
     motion: str | Path | None = None,
-    contact: Literal["rigid", "scene"] = "rigid",
     progress: Callable[[int, int], None] | None = None,
 ) -> SceneUnderCheck:
     """Compiles a scene and leads it through its motion.
@@ -247,13 +266,9 @@ def open_case(
     Args:
         source: Scene from ``read_scene``; it is not changed.
         grip: Name of the site on the tool.
-        coupling: Requested K and B; None takes the default of the simulated device.
-        period: T in s; None takes ``DEFAULT_PERIOD``.
-        scale: Handle motion per device motion.
-        workspace: Edge in m of the cube that the device reaches, > 0.
+        use: Device and run for which the scene is checked.
         motion: CSV file or recording. None takes ``NAME.csv`` beside the scene, or else the default
             hand motion of ``hapticbridge run``.
-        contact: Contact of the run: ``rigid``, its default, or ``scene``, MuJoCo's own.
         progress: Called with the number of ticks done and the total.
 
     Raises:
@@ -262,10 +277,11 @@ def open_case(
         DeviceError: The motion cannot be read, or the period, scale or workspace is out of range.
         RecordingError: The recording cannot be read.
     """
-    checked_number("workspace", workspace, "m", is_positive=True)
-    has_chosen_period, period = period is not None, DEFAULT_PERIOD if period is None else period
+    checked_number("workspace", use.workspace, "m", is_positive=True)
+    period = DEFAULT_PERIOD if use.period is None else use.period
     info = SimulatedDevice().info
-    coupling = coupling or default_coupling(info, period, scale, scale)
+    coupling = use.coupling or default_coupling(info, period, use.scale, use.scale)
+    setting = Setting(coupling, period, contact=use.contact)
     scene, refused = _compile(source, grip)
     chosen = motion_for(scene, motion)
     name = str(motion) if motion is not None else scene.path.with_suffix(".csv").name
@@ -279,9 +295,7 @@ def open_case(
     observation, fault = None, ""
     try:
         with quiet():
-            observation = observe(
-                scene, samples, Setting(coupling, period, contact=contact), progress
-            )
+            observation = observe(scene, samples, setting, progress)
         if observation.force.size < samples.size:
             samples = samples[: observation.force.size]
             name += f"; of this heavy scene the first {samples.size * period:.2g} s alone"
@@ -296,16 +310,16 @@ def open_case(
         info=info,
         coupling=coupling,
         period=period,
-        scale=scale,
+        scale=use.scale,
         motion=chosen,
         motion_name=name,
         samples=samples,
         refused=refused,
-        workspace=workspace,
-        has_chosen_period=has_chosen_period,
+        workspace=use.workspace,
+        has_chosen_period=use.period is not None,
         observation=observation,
         motion_fault=fault,
-        contact=contact,
+        contact=use.contact,
     )
 
 

@@ -69,12 +69,9 @@ def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         if fault := _soft(case, setting, pairs, push, rooms, active):
             yield fault
         for concern in contact_concerns(
-            setting.solref,
-            setting.solimp,
+            setting,
             case.step,
             cone="elliptic" if option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else "pyramidal",
-            condim=setting.condim,
-            friction=setting.friction,
             only_active=True,
         ):
             clause, change, is_cone = concern

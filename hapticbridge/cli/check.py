@@ -19,6 +19,7 @@ from hapticbridge.check.case import (
     DEFAULT_PERIOD,
     LARGEST_WORKSPACE,
     Fault,
+    IntendedUse,
     SceneUnderCheck,
     length,
     open_case,
@@ -38,6 +39,7 @@ from hapticbridge.check.lean import (
 )
 from hapticbridge.check.lean_output import check_target, lean_facts, write_lean
 from hapticbridge.check.simplify import OTHER_MOTIONS
+from hapticbridge.check.version import SceneVariant
 from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
@@ -364,12 +366,14 @@ class Check:
             case = open_case(
                 source,
                 self.grip,
-                coupling=self._coupling(period or DEFAULT_PERIOD),
-                period=period,
-                scale=self.scale,
-                workspace=self.workspace,
+                IntendedUse(
+                    coupling=self._coupling(period or DEFAULT_PERIOD),
+                    period=period,
+                    scale=self.scale,
+                    workspace=self.workspace,
+                    contact=self.contact,
+                ),
                 motion=self.motion,
-                contact=self.contact,
                 progress=show,
             )
         inventory = take_inventory(case.model, self.grip, case.places, case.observation)
@@ -407,10 +411,8 @@ class Check:
         try:
             with progress("leaner") as show:
                 return find_lean(
-                    case.source,
-                    case.scene.grip,
+                    SceneVariant(case.source, case.scene.grip, case.setting),
                     case.motion,
-                    case.setting,
                     budget=budget,
                     device_damping=(case.info.damping or 0.0) / case.scale**2,
                     progress=show,

@@ -260,36 +260,42 @@ class Concern(NamedTuple):
         return f"{self.words}; write {self.change}"
 
 
+class ContactSetting(NamedTuple):
+    """MuJoCo's parameters of a contact.
+
+    ``condim`` is 1 without friction; ``friction`` is the coefficient of sliding.
+    """
+
+    solref: tuple[float, ...]
+    solimp: tuple[float, ...]
+    condim: int = 3
+    friction: float = 1.0
+
+
 def contact_concerns(
-    solref: Sequence[float],
-    solimp: Sequence[float],
+    setting: ContactSetting,
     timestep: float,
     *,
     cone: Literal["elliptic", "pyramidal"] = "elliptic",
     diagexact: bool = True,
     refsafe: bool = True,
-    condim: int = 3,
-    friction: float = 1.0,
     only_active: bool = False,
 ) -> list[Concern]:
     """Returns the risks of a contact setting; empty for a recommended setting.
 
     Args:
-        solref: As for ``contact_numbers``, which raises the errors.
-        solimp: As for ``contact_numbers``.
+        setting: The contact's; ``contact_numbers`` raises the errors.
         timestep: h in s.
         cone: Friction cone; it matters only for condim > 1 and a friction below 0.4.
         diagexact: True if MuJoCo's exact diagonal is enabled. Without it more runs of the map's
             shipped setting create energy.
         refsafe: As for ``contact_numbers``.
-        condim: Dimension of the contact; 1 is without friction.
-        friction: Coefficient of sliding.
         only_active: If true, only risks that are likely to exceed the slack are returned.
 
     Returns:
         Risks whose words follow "the contact of …".
     """
-    numbers = contact_numbers(solref, solimp, timestep, refsafe=refsafe)
+    numbers = contact_numbers(setting.solref, setting.solimp, timestep, refsafe=refsafe)
     # + 0.0 turns a negative zero into 0
     steps, instead = numbers.relaxation + 0.0, suggested_solref(timestep)
     concerns = []
@@ -310,11 +316,12 @@ def contact_concerns(
                 f'solref="{REFERENCE_STEPS * timestep:g} 1" solimp="0.9 0.95 0.001"',
             )
         )
-    if cone == "pyramidal" and condim > 1 and friction < LOW_FRICTION:
+    if cone == "pyramidal" and setting.condim > 1 and setting.friction < LOW_FRICTION:
         concerns.append(
             Concern(
-                f"has a pyramidal cone and a friction of {friction:g}, below {LOW_FRICTION:g}, and "
-                "may create several times the energy that the coupling's slack allows",
+                f"has a pyramidal cone and a friction of {setting.friction:g}, below "
+                f"{LOW_FRICTION:g}, and may create several times the energy that the "
+                "coupling's slack allows",
                 'cone="elliptic" in <option>, or condim="1" for no friction',
                 is_cone=True,
             )
@@ -352,15 +359,6 @@ def _excess(numbers: ContactNumbers) -> str:
 
 
 # Contacts of a scene, checked against the measured rule
-
-
-class ContactSetting(NamedTuple):
-    """MuJoCo's parameters of a contact; ``friction`` is the coefficient of sliding."""
-
-    solref: tuple[float, ...]
-    solimp: tuple[float, ...]
-    condim: int
-    friction: float
 
 
 class _GeomSetting(NamedTuple):
@@ -414,14 +412,11 @@ def check_contacts(
         )
         for setting, names in names_by_setting.items()
         for concern in contact_concerns(
-            setting.solref,
-            setting.solimp,
+            setting,
             step,
             cone="elliptic" if option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else "pyramidal",
             diagexact=bool(option.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT),
             refsafe=not option.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE,
-            condim=setting.condim,
-            friction=setting.friction,
             only_active=not is_thorough,
         )
     ]
