@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from outside_scenes import hand_rows
 
-from hapticbridge.check.case import Fault, IntendedUse, SceneUnderCheck, open_case
+from hapticbridge.check.case import IntendedUse, SceneUnderCheck, open_case
 from hapticbridge.check.findings import find_faults
 from hapticbridge.scene import read_scene, scene_path
+from hapticbridge.scene.fault import Fault
 
 MAIN = """<mujoco model="bench">
   <compiler angle="radian" meshdir="meshes"/>

@@ -27,21 +27,23 @@ from check_scenes import (
 from outside_scenes import hand_rows, mjcf
 
 from hapticbridge.check import lean
-from hapticbridge.check.case import Fault, IntendedUse, length, open_case, weight
+from hapticbridge.check.case import IntendedUse, open_case
 from hapticbridge.check.contact_faults import shape_faults
-from hapticbridge.check.findings import find_faults, worst_faults
+from hapticbridge.check.findings import find_faults
 from hapticbridge.check.inventory import take_inventory
 from hapticbridge.check.lean import MAY_GO
-from hapticbridge.check.observe import Setting
 from hapticbridge.check.run_faults import run_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS, Simplification
 from hapticbridge.check.version import SceneVariant, name_everything, witness
 from hapticbridge.cli import main
 from hapticbridge.cli.main import USAGE_ERROR
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.rehearsal import Setting
 from hapticbridge.device import Motion
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.scene import compile_scene, read_scene, scene_names, scene_path
+from hapticbridge.scene.fault import Fault, length, weight
+from hapticbridge.scene.first_faults import worst_faults
 from hapticbridge.scene.physics import depth_under
 
 CONSEQUENCES = {"energy created", "MuJoCo warning", "solver iterations"}

@@ -14,9 +14,9 @@ from outside_scenes import mjcf
 from hapticbridge.check import inventory
 from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.inventory import Inventory, take_inventory
-from hapticbridge.check.source_map import Places
 from hapticbridge.scene import read_scene, scene_names, scene_path
 from hapticbridge.scene.contacts import meeting_pairs
+from hapticbridge.scene.source_map import Places
 
 
 def inventory_of(scene: Path, **options: Any) -> Inventory:

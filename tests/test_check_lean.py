@@ -21,7 +21,6 @@ from hapticbridge.check.case import motion_for
 from hapticbridge.check.cost import CHUNKS, Stage, one_pass, processor_costs
 from hapticbridge.check.lean import IS_FELT, MAY_GO, Judge, Lean, find_lean
 from hapticbridge.check.lean_output import lean_facts, write_lean
-from hapticbridge.check.observe import Setting
 from hapticbridge.check.perception import felt_error
 from hapticbridge.check.simplify import (
     contact_simplifications,
@@ -31,6 +30,7 @@ from hapticbridge.check.simplify import (
 from hapticbridge.check.version import SceneVariant, name_everything, witness
 from hapticbridge.cli import main
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.rehearsal import Setting
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
 from hapticbridge.scene import load_scene, read_scene

@@ -106,6 +106,11 @@ def test_the_core_never_imports_the_lab() -> None:
     assert not offences
 
 
+def test_a_run_imports_no_check() -> None:
+    for path in [*(PACKAGE / "run").glob("*.py"), PACKAGE / "cli" / "run.py"]:
+        assert "check" not in imported_concepts(path), path.name
+
+
 def test_a_package_names_modules_that_exist() -> None:
     offences = []
     for init in PACKAGE.rglob("__init__.py"):

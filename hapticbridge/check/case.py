@@ -1,10 +1,9 @@
-"""A scene under check (source, compiled model, motion, observation), and the faults found in it."""
+"""A scene under check: source, compiled model, motion, observation."""
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -13,71 +12,21 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.observe import Observation, Setting, observe
-from hapticbridge.check.source_map import Place, Places
+from hapticbridge.check.observe import Observation, observe
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.demand.methods import RIGID, default_method
+from hapticbridge.demand.rehearsal import Setting
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice, read_motion
 from hapticbridge.device.base import checked_number
-from hapticbridge.device.trajectory import lissajous
+from hapticbridge.device.trajectory import DEFAULT_SECONDS, lissajous
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.recording import read_recording
 from hapticbridge.scene import Scene, SceneSource, compile_scene
-
-# Faults, each with its place and remedy
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """One fault of a scene.
-
-    Attributes:
-        kind: Name of the kind of fault.
-        place: File, line and element.
-        sentence: Description with its numbers.
-        change: Text to write at the place.
-        is_note: True if a run works as well without the change; the scene counts as sound.
-    """
-
-    kind: str
-    place: Place
-    sentence: str
-    change: str
-    is_note: bool = False
-
-
-def number(value: float) -> str:
-    """Formats a number with three digits and no exponent: ``2500``, ``0.0375``."""
-    if not math.isfinite(value):
-        return "infinite"
-    return np.format_float_positional(float(f"{value:.3g}"), trim="-")
-
-
-def length(value: float) -> str:
-    """Formats a length given in m: ``375 µm``, ``4.2 mm``, ``3.1 m``."""
-    for unit, size in (("m", 1.0), ("mm", 1e-3)):
-        if abs(value) >= size:
-            return f"{number(value / size)} {unit}"
-    return f"{number(1e6 * value)} µm"
-
-
-def weight(mass: float) -> str:
-    """Formats a mass given in kg: ``1.2 kg``, ``35 g``."""
-    return f"{number(mass)} kg" if mass >= 0.1 else f"{number(1e3 * mass)} g"
-
-
-def numbers(values: Iterable[float]) -> str:
-    """Formats the values of an attribute: ``0.9 0.95 0.001``."""
-    return " ".join(f"{value:g}" for value in values)
-
-
-def others(count: int) -> str:
-    """Returns " and N more", or nothing for N = 0."""
-    return f" and {count} more" if count > 0 else ""
-
+from hapticbridge.scene.fault import CompiledScene
+from hapticbridge.scene.source_map import Places
 
 # Motion for a check: the scene's own hand path, a file of poses, or a recording
 
@@ -137,45 +86,12 @@ LARGEST_WORKSPACE = 0.4
 (Novint Falcon) to 0.4 m (Force Dimension delta.3), so a motion beyond it fits none of them. The
 simulated device has no walls."""
 
-DEFAULT_SECONDS = 5.0
-"""Duration in s of the default hand motion, which reaches its full size after 2 s."""
 
 _DEFAULT_STEP = 0.01  # s; the motion's fastest part has 0.41 Hz
 _REFUSED = re.compile(r"(mass and inertia of|inertia must satisfy).*?, id (\d+)")
 STAND_IN_MASS, STAND_IN_INERTIA = 0.01, 1e-6
 """Mass in kg and inertia in kg m² that replace an inertia refused by MuJoCo: those of a thing on a
 fingertip."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CompiledScene:
-    """A scene with its files, which is all that a rule without a motion needs.
-
-    Attributes:
-        source: The scene as its files describe it.
-        scene: The scene as it runs, with handle and coupling.
-        places: Lines of the files on which elements are written.
-    """
-
-    source: SceneSource
-    scene: Scene
-    places: Places
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        """Compiled scene with handle, at its running time step."""
-        return self.scene.model
-
-    @property
-    def step(self) -> float:
-        """Time step h in s."""
-        return float(self.model.opt.timestep)
-
-    @property
-    def tool_bodies(self) -> NDArray[np.bool_]:
-        """True for each body of the grip's tree, (nbody,)."""
-        tree = self.model.body_treeid[self.model.site(self.scene.grip).bodyid[0]]
-        return np.asarray(self.model.body_treeid == tree, dtype=bool)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

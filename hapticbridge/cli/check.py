@@ -18,13 +18,9 @@ from hapticbridge.arguments import option, shared
 from hapticbridge.check.case import (
     DEFAULT_PERIOD,
     LARGEST_WORKSPACE,
-    Fault,
     IntendedUse,
     SceneUnderCheck,
-    length,
     open_case,
-    others,
-    weight,
 )
 from hapticbridge.check.cost import TICK_SHARE, Cost, Growth, draw_cost, measure_cost
 from hapticbridge.check.findings import find_faults
@@ -52,6 +48,7 @@ from hapticbridge.plotting import check_ending, write_picture
 from hapticbridge.run.hands import Grasp
 from hapticbridge.run.options import BridgeOptions, Workspace
 from hapticbridge.scene import plain_model, read_scene, settings_from
+from hapticbridge.scene.fault import Fault, length, others, weight
 from hapticbridge.units import format_si
 
 _HEADINGS = ("alone", "cost", "JND", "tool force, RMS", "peak", "tool torque, RMS", "tool off by")
