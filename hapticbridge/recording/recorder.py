@@ -130,6 +130,10 @@ run()
 # need. The explicit path loads this very package with any sys.path of the child.
 
 
+START_TIMEOUT = 30.0
+"""Longest time in s until the recorder's file is open. A busy machine takes seconds to start it."""
+
+
 class Recorder:
     """Starts the recorder's process and sends events to it without blocking the loop.
 
@@ -200,19 +204,17 @@ class Recorder:
             self._sender.start()
             self._is_started = True
 
-    def wait_until_ready(self, timeout: float = 30.0) -> None:
+    def wait_until_ready(self) -> None:
         """Waits until the file is open and has its metadata and attachments.
-
-        ``timeout`` is the longest wait in s.
 
         Raises:
             RecordingError: The file cannot be written, the process died, or the time is over.
         """
         try:
-            answer = self._answers.get(timeout=timeout)
+            answer = self._answers.get(timeout=START_TIMEOUT)
         except Empty:
             self.abort()
-            raise RecordingError(f"the recorder did not start within {timeout} s") from None
+            raise RecordingError(f"the recorder did not start within {START_TIMEOUT:g} s") from None
         if "ready" not in answer:
             raise self._failure(answer)
 

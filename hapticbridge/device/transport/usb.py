@@ -64,15 +64,14 @@ class OnTheBus:
     has_hidraw: bool
 
 
-def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
+def on_the_bus() -> list[OnTheBus]:
     """Lists the devices on the USB bus, in the order of their bus positions; empty without a bus.
 
     This requires neither libusb nor a permission. A device unplugged meanwhile is left out.
     """
-    folder = BUS if bus is None else bus
     found = []
     try:
-        entries = sorted(folder.iterdir())
+        entries = sorted(BUS.iterdir())
     except OSError:
         return []
     for entry in entries:
