@@ -22,6 +22,18 @@ class SceneError(HapticBridgeError):
     """A scene cannot be loaded or cannot be coupled to a haptic device."""
 
 
+class SceneWarning(UserWarning):
+    """A run deviates from its scene's file, or a port meters too little.
+
+    Attributes:
+        concern: Sentence on what deviates, without the name of the scene.
+    """
+
+    def __init__(self, scene: object, concern: str) -> None:
+        super().__init__(f"scene '{scene}': {concern}")
+        self.concern = concern
+
+
 class CouplingError(HapticBridgeError):
     """A virtual coupling's parameter is out of range."""
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from outside_scenes import hand_rows
 
-from hapticbridge.check.case import Fault, SceneUnderCheck, open_case
+from hapticbridge.check.case import IntendedUse, SceneUnderCheck, open_case
 from hapticbridge.check.findings import find_faults
 from hapticbridge.scene import read_scene, scene_path
+from hapticbridge.scene.fault import Fault
 
 MAIN = """<mujoco model="bench">
   <compiler angle="radian" meshdir="meshes"/>
@@ -184,8 +186,8 @@ GOOD_CONTACT = '<default><geom solref="0.002 1" solimp="0.9 0.95 0.001"/></defau
 KEY = f'<key name="home" qpos="{START}"/>'
 
 
-def case_of(scene: Path, **options: object) -> SceneUnderCheck:
-    return open_case(read_scene(scene), **options)  # type: ignore[arg-type] # by the test
+def case_of(scene: Path, motion: Path | None = None, **options: Any) -> SceneUnderCheck:
+    return open_case(read_scene(scene), use=IntendedUse(**options), motion=motion)
 
 
 @functools.cache
@@ -194,8 +196,8 @@ def shipped_case(name: str) -> SceneUnderCheck:
     return case_of(scene_path(name))
 
 
-def faults_of(scene: Path, **options: object) -> tuple[Fault, ...]:
-    return find_faults(case_of(scene, **options))
+def faults_of(scene: Path, motion: Path | None = None, **options: Any) -> tuple[Fault, ...]:
+    return find_faults(case_of(scene, motion, **options))
 
 
 def kinds(faults: tuple[Fault, ...]) -> set[str]:

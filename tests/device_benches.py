@@ -64,8 +64,11 @@ class FalconBench:
         self.link = VirtualLink(self.time)
         self.told: list[str] = []
 
-    def opened(self, **options: Any) -> FalconDevice:
-        return FalconDevice(self.link, notify=self.told.append, **options)
+    def opened(
+        self, name: str = "falcon", firmware: str | None = None, **numbers: float
+    ) -> FalconDevice:
+        return FalconDevice(self.link, name=name, firmware=firmware, numbers=numbers,
+                            notify=self.told.append)  # fmt: skip
 
     def clock(self, drift: float = 0.0) -> VirtualClock:
         clock = VirtualClock(self.time, drift)

@@ -12,8 +12,8 @@ import pytest
 from hapticbridge.check import cost as costs
 from hapticbridge.check.case import samples_of
 from hapticbridge.check.cost import Cost, measure_cost
-from hapticbridge.check.observe import Setting
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.rehearsal import Setting
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
 from hapticbridge.scene import load_scene, scene_path

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -27,21 +27,23 @@ from check_scenes import (
 from outside_scenes import hand_rows, mjcf
 
 from hapticbridge.check import lean
-from hapticbridge.check.case import Fault, length, open_case, weight
+from hapticbridge.check.case import IntendedUse, open_case
 from hapticbridge.check.contact_faults import shape_faults
-from hapticbridge.check.findings import find_faults, worst_faults
+from hapticbridge.check.findings import find_faults
 from hapticbridge.check.inventory import take_inventory
 from hapticbridge.check.lean import MAY_GO
-from hapticbridge.check.observe import Setting
 from hapticbridge.check.run_faults import run_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS, Simplification
 from hapticbridge.check.version import SceneVariant, name_everything, witness
 from hapticbridge.cli import main
 from hapticbridge.cli.main import USAGE_ERROR
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.rehearsal import Setting
 from hapticbridge.device import Motion
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.scene import compile_scene, read_scene, scene_names, scene_path
+from hapticbridge.scene.fault import Fault, length, weight
+from hapticbridge.scene.first_faults import worst_faults
 from hapticbridge.scene.physics import depth_under
 
 CONSEQUENCES = {"energy created", "MuJoCo warning", "solver iterations"}
@@ -58,8 +60,10 @@ SHAPES = {"box edges", "mesh faces"}
 
 FLOOR = '<geom name="floor" type="plane" size="1 1 1"/>'
 
+OWN_CONTACTS = IntendedUse(contact="scene")
 
-def faults_in(folder: Path, text: str, motion: str = "", **options: object) -> tuple[Fault, ...]:
+
+def faults_in(folder: Path, text: str, motion: str = "", **options: Any) -> tuple[Fault, ...]:
     return faults_of(written(folder, text, motion), **options)
 
 
@@ -194,7 +198,7 @@ def test_peg_sinks_deeper_than_its_clearance_with_mujocos_default(tmp_path: Path
 )
 def test_needless_softness_is(tmp_path: Path, solref: str, clearance: float, is_told: bool) -> None:
     source = read_scene(peg_with(tmp_path, solref), clearance=clearance)
-    faults = find_faults(open_case(source, contact="scene"))
+    faults = find_faults(open_case(source, use=OWN_CONTACTS))
     told = [fault.sentence for fault in faults if fault.kind == "soft contact"]
     assert bool(told) == is_told
     for sentence in told:  # of postures, none quite straight
@@ -280,12 +284,12 @@ def test_time_step_is_no_fault_where_the_rate_was_asked_for(tmp_path: Path) -> N
 def test_contact_that_created_energy_is_named_with_a_setting_that_does_not(tmp_path: Path) -> None:
     source = read_scene("peg_in_hole", clearance=1e-3)
     assert find_faults(open_case(source)) == ()
-    fault = one_of("energy created", find_faults(open_case(source, contact="scene")))
+    fault = one_of("energy created", find_faults(open_case(source, use=OWN_CONTACTS)))
     assert "% of the coupling's slack, which covers it" in fault.sentence
     change = fault.change.split(" there")[0]
     assert change == 'solref="0.0005 8"'
     mended = read_scene(peg_with(tmp_path, "0.0005 8"), clearance=1e-3)
-    assert "energy created" not in kinds(find_faults(open_case(mended, contact="scene")))
+    assert "energy created" not in kinds(find_faults(open_case(mended, use=OWN_CONTACTS)))
 
 
 def test_motion_that_does_not_end_is_a_fault_and_no_error(tmp_path: Path) -> None:
@@ -410,7 +414,7 @@ def lean_by(
     source = read_scene(written(folder, mjcf(GOOD_OPTION, GOOD_CONTACT, body=BALL)))
     setting = Setting(Coupling(2400.0, 0.5, 2.4, 5e-4))
     cost = lambda *_: (1.0, next(told, costs[-1]))  # noqa: E731
-    return lean.find_lean(source, "grip", still, setting, cost=cost)
+    return lean.find_lean(SceneVariant(source, "grip", setting), still, cost=cost)
 
 
 def relax(draft: SceneVariant) -> bool:

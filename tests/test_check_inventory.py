@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -13,12 +14,12 @@ from outside_scenes import mjcf
 from hapticbridge.check import inventory
 from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.inventory import Inventory, take_inventory
-from hapticbridge.check.source_map import Places
 from hapticbridge.scene import read_scene, scene_names, scene_path
 from hapticbridge.scene.contacts import meeting_pairs
+from hapticbridge.scene.source_map import Places
 
 
-def inventory_of(scene: Path, **options: object) -> Inventory:
+def inventory_of(scene: Path, **options: Any) -> Inventory:
     return inventory_in(case_of(scene, **options))
 
 

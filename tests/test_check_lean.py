@@ -21,7 +21,6 @@ from hapticbridge.check.case import motion_for
 from hapticbridge.check.cost import CHUNKS, Stage, one_pass, processor_costs
 from hapticbridge.check.lean import IS_FELT, MAY_GO, Judge, Lean, find_lean
 from hapticbridge.check.lean_output import lean_facts, write_lean
-from hapticbridge.check.observe import Setting
 from hapticbridge.check.perception import felt_error
 from hapticbridge.check.simplify import (
     contact_simplifications,
@@ -31,6 +30,7 @@ from hapticbridge.check.simplify import (
 from hapticbridge.check.version import SceneVariant, name_everything, witness
 from hapticbridge.cli import main
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.rehearsal import Setting
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
 from hapticbridge.scene import load_scene, read_scene
@@ -69,7 +69,9 @@ def own_motion(name: str, seconds: float = np.inf, speed: float = 1.0) -> Motion
 def found() -> Lean:
     # four times as fast as the path on which the outcome is judged, to save time
     motion = own_motion("peg_in_hole", speed=4.0)
-    return find_lean(over_modelled_peg(), "grip", motion, Setting(COUPLING), cost=planted)
+    return find_lean(
+        SceneVariant(over_modelled_peg(), "grip", Setting(COUPLING)), motion, cost=planted
+    )
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +125,7 @@ def test_smaller_budget_takes_less(found: Lean, monkeypatch: pytest.MonkeyPatch)
     chosen = lambda *told: [each for each in every(*told) if each.name in two]  # noqa: E731
     monkeypatch.setattr(lean, "all_simplifications", chosen)
     how: Any = {"budget": 0.01, "cost": planted}
-    strict = find_lean(over_modelled_peg(), "grip", motion, Setting(COUPLING), **how)
+    strict = find_lean(SceneVariant(over_modelled_peg(), "grip", Setting(COUPLING)), motion, **how)
     verdicts = {trial.name: trial.verdict for trial in strict.alone}
     assert verdicts == {"primitives": IS_FELT, "usual tolerance": MAY_GO}
 
@@ -261,7 +263,7 @@ def lean_of(path: Path) -> Lean:
     down = np.zeros((21, 3))
     down[:, 2] = -0.004 * np.sin(np.linspace(0, np.pi, 21))
     motion = Motion(np.linspace(0, 0.5, 21), down)
-    return find_lean(read_scene(path), "tip", motion, Setting(COUPLING), cost=planted)
+    return find_lean(SceneVariant(read_scene(path), "tip", Setting(COUPLING)), motion, cost=planted)
 
 
 def test_scene_with_includes_and_meshes_is_written_elsewhere(with_files: Path) -> None:
@@ -368,7 +370,7 @@ def test_progress_ends_and_where_nothing_may_go_nothing_is_written(tmp_path: Pat
     told: list[tuple[float, float, str]] = []
     source, motion = read_scene("virtual_wall"), own_motion("virtual_wall", 2.0)
     how: Any = {"cost": lambda *_: (1.0, 1.0), "progress": lambda *news: told.append(news)}
-    lean = find_lean(source, "grip", motion, Setting(COUPLING), **how)
+    lean = find_lean(SceneVariant(source, "grip", Setting(COUPLING)), motion, **how)
     done = [part for part, _, _ in told]
     assert (done, done[-1]) == (sorted(done), told[-1][1])
     assert lean.together == ()

@@ -8,15 +8,9 @@ from cli_cases import Called
 
 from hapticbridge.check.case import open_case
 from hapticbridge.check.findings import own_motion_faults
-from hapticbridge.check.observe import Setting
-from hapticbridge.check.own_motion import (
-    NO_HAND,
-    NOTABLE_ENERGY,
-    OwnMotion,
-    own_motion,
-    own_substeps,
-)
+from hapticbridge.demand.rehearsal import Setting
 from hapticbridge.kernel.ledger import ENERGY_TOLERANCE
+from hapticbridge.run.own_motion import NO_HAND, NOTABLE_ENERGY, OwnMotion, own_motion, own_substeps
 from hapticbridge.scene import SceneSource, compile_scene, read_scene
 from hapticbridge.scene.checks import first_pump
 

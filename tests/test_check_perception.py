@@ -12,10 +12,10 @@ from outside_scenes import scene_file
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.check.lean import find_lean
-from hapticbridge.check.observe import Setting
 from hapticbridge.check.perception import FORCE_FLOOR, LEVER, WEBER, felt_error
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.rehearsal import Setting
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.kernel.record import TICK_DTYPE
@@ -114,9 +114,9 @@ def test_what_is_not_one_motion_and_bad_budgets_are_refused() -> None:
     source, setting = read_scene("virtual_wall"), Setting(Coupling(2400.0, 0.5, 2.4, 5e-4))
     short, motion = (Motion(np.array([0.0, end]), np.zeros((2, 3))) for end in (1e-4, 1.0))
     with pytest.raises(SceneError, match="less than one tick"):
-        find_lean(source, "grip", short, setting)
+        find_lean(SceneVariant(source, "grip", setting), short)
     for budget in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(SceneError, match="budget"):
-            find_lean(source, "grip", motion, setting, budget=budget)
+            find_lean(SceneVariant(source, "grip", setting), motion, budget=budget)
     with pytest.raises(HapticBridgeError, match="period"):
-        find_lean(source, "grip", motion, replace(setting, period=-1.0))
+        find_lean(SceneVariant(source, "grip", replace(setting, period=-1.0)), motion)

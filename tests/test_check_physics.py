@@ -11,12 +11,12 @@ import pytest
 from check_scenes import CUP_DEPTH, CUP_ROOM, GOOD_OPTION, case_of, cup_obj, written
 from outside_scenes import hand_rows, mjcf
 
-from hapticbridge.check.case import length, number, weight
-from hapticbridge.check.constraint_faults import creep_speed
 from hapticbridge.check.contact_faults import inertia_of
 from hapticbridge.check.geometry_faults import dent_of
 from hapticbridge.scene import physics, scene_path
 from hapticbridge.scene.contacts import settings_among
+from hapticbridge.scene.fault import length, number, weight
+from hapticbridge.scene.first_faults import creep_speed
 from hapticbridge.scene.physics import constraint_stiffness, depth_under, mesh_of
 
 SINKS = [

@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.check import lean, simplify
 from hapticbridge.check.case import motion_for
 from hapticbridge.check.lean import IS_FELT, MAY_GO, Judge, VariantVerdict
-from hapticbridge.check.observe import Setting
 from hapticbridge.check.simplify import Simplification
 from hapticbridge.check.version import CLEARANCE, SceneVariant, name_everything, witness
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.rehearsal import Setting
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.mujoco_c import quiet

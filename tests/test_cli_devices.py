@@ -23,7 +23,6 @@ from hapticbridge.device.driver import (
     Driver,
     FoundDevice,
     access_problem,
-    permission_problem,
 )
 from hapticbridge.device.rawhid import serial
 from hapticbridge.device.registry import all_drivers
@@ -95,10 +94,10 @@ def test_a_spacenavigator_without_a_node_is_listed_with_the_module_it_wants(
     assert "Teensyduino RawHID" not in out  # it has a node: hidapi lists it, where it is there
 
 
-def listed(problem: str | None, serial: str = "") -> FoundDevice:
+def listed(problem: str | None, serial: str = "", *, is_refused: bool = False) -> FoundDevice:
     return FoundDevice(
         driver="rawhid", name="[red]Te\x1bensy", serial=serial, path="/dev/hidraw0", vendor=0x16C0,
-        product=0x0486, transport="hid", problem=problem,
+        product=0x0486, transport="hid", problem=problem, lacks_permission=is_refused,
     )  # fmt: skip
 
 
@@ -161,7 +160,7 @@ def test_wheels_of_any_vendor_have_a_permission(bus: Path) -> None:
         ),
         ([mouse(None)], "  next: hapticbridge run peg_in_hole --device spacemouse\n"),
         (
-            [listed(permission_problem("/dev/hidraw0"))],
+            [listed(None, is_refused=True)],
             "local users of the machine\n  next: hapticbridge devices",
         ),
         # no rule would help, and one of two can be used

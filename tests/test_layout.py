@@ -106,6 +106,11 @@ def test_the_core_never_imports_the_lab() -> None:
     assert not offences
 
 
+def test_a_run_imports_no_check() -> None:
+    for path in [*(PACKAGE / "run").glob("*.py"), PACKAGE / "cli" / "run.py"]:
+        assert "check" not in imported_concepts(path), path.name
+
+
 def test_a_package_names_modules_that_exist() -> None:
     offences = []
     for init in PACKAGE.rglob("__init__.py"):
@@ -327,7 +332,7 @@ def test_a_write_to_a_part_of_the_state_is_found(line: str) -> None:
 
 MESSAGES = re.compile(
     "reason|sentence|words|message|remark|cause|clause|fault|concern|remed|problem|hint|finding"
-    "|agreement|resimulation|silence|alarm|slowness"
+    "|agreement|resimulation|silence|alarm|slowness|change|warned|problem"
 )
 """Names of texts for readers: a name or attribute that holds one has one of these in it."""
 
@@ -337,6 +342,10 @@ READING |= {"removeprefix", "removesuffix", "count"}
 
 READ_BACK: set[str] = set()
 """Places that may read a text for readers; none does."""
+
+
+KEYS = {"name", "word", "event"}
+"""Variables of loops that hold a key, a part of a command or a record, and no text for readers."""
 
 
 def name_of_text(node: ast.expr) -> str:
@@ -365,14 +374,25 @@ def read_messages(source: str) -> list[str]:
     """Returns the expressions that take a text for readers apart, or compare it with another.
 
     ``split()`` without an argument removes line breaks alone. A text that is all in capitals, and
-    one in a set of names, is a code.
+    one in a set of names, is a code. A variable of a loop is a text if it runs over texts.
     """
     found: list[ast.expr] = []
-    for node in ast.walk(ast.parse(source)):
+    tree = ast.parse(source)
+    loops = [node for node in ast.walk(tree) if isinstance(node, ast.For | ast.comprehension)]
+    sources: dict[str, list[str]] = {}
+    for loop in loops:
+        if isinstance(loop.target, ast.Name) and loop.target.id not in KEYS:
+            sources.setdefault(loop.target.id, []).append(name_of_text(loop.iter))
+
+    def is_text(node: ast.expr) -> bool:
+        name = name_of_text(node)
+        return any(map(MESSAGES.search, (name, *sources.get(name, ()))))
+
+    for node in ast.walk(tree):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             owner = node.func.value
             if node.func.attr in READING and node.args and not is_string(owner):
-                found += [node] if MESSAGES.search(name_of_text(owner)) else []
+                found += [node] if is_text(owner) else []
         elif isinstance(node, ast.Compare):
             sides = [node.left, *node.comparators]
             for operator, left, right in zip(node.ops, sides, sides[1:], strict=False):
@@ -380,9 +400,16 @@ def read_messages(source: str) -> list[str]:
                 is_within = isinstance(operator, ast.In | ast.NotIn)
                 texts = [left, right] if is_equal and (is_string(left) or is_string(right)) else []
                 texts += [right] if is_within and (is_string(left) or is_code(left)) else []
-                names = (name_of_text(each) for each in texts if not is_string(each))
-                found += [node] if any(map(MESSAGES.search, names)) else []
+                is_made = is_equal and (is_sentence_of(left) or is_sentence_of(right))
+                texts = [each for each in texts if not is_string(each)]
+                found += [node] if is_made or any(map(is_text, texts)) else []
     return [ast.unparse(node) for node in found]
+
+
+def is_sentence_of(node: ast.expr) -> bool:
+    """Returns True for a call of a function whose name says that it returns a text for readers."""
+    function = node.func if isinstance(node, ast.Call) else node
+    return function is not node and bool(MESSAGES.search(name_of_text(function)))
 
 
 def is_code(node: ast.expr) -> bool:
@@ -401,6 +428,10 @@ def is_code(node: ast.expr) -> bool:
         'report.resimulation == "bit for bit"',
         'event["reason"].split(": ")',
         'concerns[0].rpartition("; write ")',
+        '[str(change).partition(" (")[0] for change in changes]',
+        "for each in scene.changes:\n    each.startswith(KINDS)",
+        "[text.removeprefix(path) for text in messages]",
+        "self.problem == permission_problem(self.path)",
     ],
 )
 def test_a_sentence_that_is_read_back_is_found(line: str) -> None:

@@ -23,7 +23,7 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.kernel.record import FORMAT, TICK_DTYPE, TickFlag
 from hapticbridge.recording import TAIL, Attachment, Recorder, Ring, read_recording
 from hapticbridge.recording import recorder as recorder_module
-from hapticbridge.recording.recorder import RecordStream
+from hapticbridge.recording.recorder import RecordOutput, RecordStream
 from hapticbridge.recording.recorder_process import LiveLine, RunState
 
 META = {"method": "implicit", "device": "{}"}
@@ -405,7 +405,7 @@ def test_a_stop_while_the_process_starts_leaves_neither_process_nor_file(
 
     monkeypatch.setattr(threading, "Thread", StruckThread)
     monkeypatch.setattr(recorder_module, "recorder_process", struck)
-    stream = RecordStream(path, 1e-3, live=False, may_wait=True)
+    stream = RecordStream(RecordOutput(path), 1e-3, may_wait=True)
     with pytest.raises(KeyboardInterrupt):
         stream.start(META, ())
     stream.close(is_discarded=True)

@@ -17,7 +17,12 @@ from hapticbridge.demand.methods import prepare
 from hapticbridge.errors import SceneError
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import contacts, load_scene, scene_names
-from hapticbridge.scene.contacts import check_contacts, contact_concerns, contact_numbers
+from hapticbridge.scene.contacts import (
+    ContactSetting,
+    check_contacts,
+    contact_concerns,
+    contact_numbers,
+)
 
 H = 1e-3
 SOLIMP = (0.9, 0.95, 0.001)
@@ -56,7 +61,7 @@ def test_shipped_setting_relaxes_within_3_8_steps_and_is_within_the_slack() -> N
     assert numbers.stiffness == pytest.approx(9 / 4, rel=0.02)
     assert numbers.impedance == pytest.approx(0.901)
     assert numbers.grade == "within slack"
-    assert contact_concerns((0.002, 1.0), SOLIMP, H) == []
+    assert contact_concerns(ContactSetting((0.002, 1.0), SOLIMP), H) == []
 
 
 @given(st.floats(1e-5, 0.1), st.floats(0.05, 100), st.floats(1e-4, 1e-2), st.floats(0.01, 0.999))
@@ -79,7 +84,9 @@ def test_softer_is_never_worse(timeconst: float, ratio: float, longer: float, mo
 def test_suggestion_is_strict_and_silent_at_every_time_step(timestep: float) -> None:
     first, second = contacts.SUGGESTED[0] * timestep, contacts.SUGGESTED[1]
     assert contact_numbers((first, second), SOLIMP, timestep).grade == "strict"
-    assert contact_concerns((first, second), SOLIMP, timestep, diagexact=False) == []
+    assert (
+        contact_concerns(ContactSetting((first, second), SOLIMP), timestep, diagexact=False) == []
+    )
     words = contacts.suggested_solref(timestep).split('"')[1].split()
     assert [float(word) for word in words] == pytest.approx([first, second], rel=1e-5)
 
@@ -99,7 +106,7 @@ NOT_MET = f'<geom name="lamp" size="0.01" pos="3 3 3" contype="4" conaffinity="4
     ],
 )  # fmt: skip
 def test_what_to_write_is_told(solref: Any, solimp: Any, words: tuple[str, ...]) -> None:
-    (said, *_) = contact_concerns(solref, solimp, H)
+    (said, *_) = contact_concerns(ContactSetting(solref, solimp), H)
     assert all(word in str(said) for word in words)
     assert (contact_numbers(solref, solimp, H).grade == "active") == (len(words) > 1)
 
@@ -115,15 +122,21 @@ def test_bad_numbers_are_refused(solref: Any, solimp: Any, timestep: float) -> N
 
 
 def test_pyramids_are_named_only_where_friction_is_low_but_not_left_out() -> None:
-    (said,) = contact_concerns((0.0005, 8.0), SOLIMP, H, cone="pyramidal", friction=0.1)
+    (said,) = contact_concerns(
+        ContactSetting((0.0005, 8.0), SOLIMP, friction=0.1), H, cone="pyramidal"
+    )
     assert 'write cone="elliptic"' in str(said)
-    rough = contact_concerns((0.0005, 8.0), SOLIMP, H, cone="pyramidal", friction=0.42)
-    without = contact_concerns((0.0005, 8.0), SOLIMP, H, cone="pyramidal", condim=1, friction=0.0)
+    rough = contact_concerns(
+        ContactSetting((0.0005, 8.0), SOLIMP, friction=0.42), H, cone="pyramidal"
+    )
+    without = contact_concerns(
+        ContactSetting((0.0005, 8.0), SOLIMP, condim=1, friction=0.0), H, cone="pyramidal"
+    )
     assert rough == without == []
 
 
 def test_approximate_diagonal_is_named_unless_the_contact_is_strict_anyway() -> None:
-    (said,) = contact_concerns((0.002, 1.0), SOLIMP, H, diagexact=False)
+    (said,) = contact_concerns(ContactSetting((0.002, 1.0), SOLIMP), H, diagexact=False)
     assert 'write <flag diagexact="enable"/>' in str(said)
 
 

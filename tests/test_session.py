@@ -8,10 +8,11 @@ from bridge_runs import still, sway
 
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.errors import HapticBridgeError, SceneError
+from hapticbridge.recording.recorder import RecordOutput
 from hapticbridge.run.hands import Grasp
 from hapticbridge.run.options import BridgeOptions
 from hapticbridge.run.request import RunRequest
-from hapticbridge.run.session import RecordOutput, Session, StopRequest
+from hapticbridge.run.session import Session, StopRequest
 from hapticbridge.scene import load_scene
 
 

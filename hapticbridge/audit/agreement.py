@@ -173,9 +173,8 @@ def scene_statements(
     meta, source = recording.meta, "the attached sources"
     values, changes = _json(meta, "scene_parameters"), _json(meta, "scene_changes")
     yield Statement("metadata 'scene_parameters'", values, scene.parameters, source)
-    yield Statement(
-        "metadata 'scene_changes'", _reasoned(changes), _reasoned(scene.changes), source
-    )
+    stated, derived = _determined(changes, scene), _determined(list(scene.changes), scene)
+    yield Statement("metadata 'scene_changes'", stated, derived, source)
     state = recording.attachments.get(STATE_ATTACHMENT, b"")
     start = start_state(scene.model, scene.data)
     stated = np.frombuffer(state, "<f8") if len(state) == start.nbytes else np.zeros(0)
@@ -191,11 +190,15 @@ def scene_statements(
         yield from _differences(own, derived, source, is_exact=is_exact)
 
 
-def _reasoned(changes: Any) -> Any:
-    """Returns changes of a scene without the reason in brackets, which may be the user's wish."""
-    if not isinstance(changes, (list, tuple)):
+def _determined(changes: Any, scene: Scene) -> Any:
+    """Returns the changes that the scene alone determines.
+
+    The weight of a tool is carried for a reason of the run, and recorded as ``tool_weight`` too.
+    """
+    if not isinstance(changes, list) or len(changes) != len(scene.differences):
         return changes
-    return [str(change).partition(" (")[0] for change in changes]
+    own = zip(changes, scene.differences, strict=True)
+    return [words for words, difference in own if not difference.reason]
 
 
 def _agrees(stated: Any, derived: Any, *, is_exact: bool) -> bool:

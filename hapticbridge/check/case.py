@@ -1,10 +1,9 @@
-"""A scene under check (source, compiled model, motion, observation), and the faults found in it."""
+"""A scene under check: source, compiled model, motion, observation."""
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -13,71 +12,21 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.observe import Observation, Setting, observe
-from hapticbridge.check.source_map import Place, Places
+from hapticbridge.check.observe import Observation, observe
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.demand.methods import RIGID, default_method
+from hapticbridge.demand.rehearsal import Setting
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice, read_motion
 from hapticbridge.device.base import checked_number
-from hapticbridge.device.trajectory import lissajous
+from hapticbridge.device.trajectory import DEFAULT_SECONDS, lissajous
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.recording import read_recording
 from hapticbridge.scene import Scene, SceneSource, compile_scene
-
-# Faults, each with its place and remedy
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """One fault of a scene.
-
-    Attributes:
-        kind: Name of the kind of fault.
-        place: File, line and element.
-        sentence: Description with its numbers.
-        change: Text to write at the place.
-        is_note: True if a run works as well without the change; the scene counts as sound.
-    """
-
-    kind: str
-    place: Place
-    sentence: str
-    change: str
-    is_note: bool = False
-
-
-def number(value: float) -> str:
-    """Formats a number with three digits and no exponent: ``2500``, ``0.0375``."""
-    if not math.isfinite(value):
-        return "infinite"
-    return np.format_float_positional(float(f"{value:.3g}"), trim="-")
-
-
-def length(value: float) -> str:
-    """Formats a length given in m: ``375 µm``, ``4.2 mm``, ``3.1 m``."""
-    for unit, size in (("m", 1.0), ("mm", 1e-3)):
-        if abs(value) >= size:
-            return f"{number(value / size)} {unit}"
-    return f"{number(1e6 * value)} µm"
-
-
-def weight(mass: float) -> str:
-    """Formats a mass given in kg: ``1.2 kg``, ``35 g``."""
-    return f"{number(mass)} kg" if mass >= 0.1 else f"{number(1e3 * mass)} g"
-
-
-def numbers(values: Iterable[float]) -> str:
-    """Formats the values of an attribute: ``0.9 0.95 0.001``."""
-    return " ".join(f"{value:g}" for value in values)
-
-
-def others(count: int) -> str:
-    """Returns " and N more", or nothing for N = 0."""
-    return f" and {count} more" if count > 0 else ""
-
+from hapticbridge.scene.fault import CompiledScene
+from hapticbridge.scene.source_map import Places
 
 # Motion for a check: the scene's own hand path, a file of poses, or a recording
 
@@ -137,45 +86,12 @@ LARGEST_WORKSPACE = 0.4
 (Novint Falcon) to 0.4 m (Force Dimension delta.3), so a motion beyond it fits none of them. The
 simulated device has no walls."""
 
-DEFAULT_SECONDS = 5.0
-"""Duration in s of the default hand motion, which reaches its full size after 2 s."""
 
 _DEFAULT_STEP = 0.01  # s; the motion's fastest part has 0.41 Hz
 _REFUSED = re.compile(r"(mass and inertia of|inertia must satisfy).*?, id (\d+)")
 STAND_IN_MASS, STAND_IN_INERTIA = 0.01, 1e-6
 """Mass in kg and inertia in kg m² that replace an inertia refused by MuJoCo: those of a thing on a
 fingertip."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CompiledScene:
-    """A scene with its files, which is all that a rule without a motion needs.
-
-    Attributes:
-        source: The scene as its files describe it.
-        scene: The scene as it runs, with handle and coupling.
-        places: Lines of the files on which elements are written.
-    """
-
-    source: SceneSource
-    scene: Scene
-    places: Places
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        """Compiled scene with handle, at its running time step."""
-        return self.scene.model
-
-    @property
-    def step(self) -> float:
-        """Time step h in s."""
-        return float(self.model.opt.timestep)
-
-    @property
-    def tool_bodies(self) -> NDArray[np.bool_]:
-        """True for each body of the grip's tree, (nbody,)."""
-        tree = self.model.body_treeid[self.model.site(self.scene.grip).bodyid[0]]
-        return np.asarray(self.model.body_treeid == tree, dtype=bool)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -230,16 +146,35 @@ class SceneUnderCheck(CompiledScene):
         return default_method().law_coupling(self.coupling, self.period)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IntendedUse:
+    """Device and run for which a scene is checked.
+
+    Attributes:
+        coupling: Requested K and B; None takes the default of the simulated device.
+        period: T in s; None takes ``DEFAULT_PERIOD``.
+        scale: Handle motion per device motion.
+        workspace: Edge in m of the cube that the device reaches, > 0.
+        contact: Contact of the run: ``rigid``, its default, or ``scene``, MuJoCo's own.
+    """
+
+    coupling: Coupling | None = None
+    period: float | None = None
+    scale: float = 1.0
+    workspace: float = LARGEST_WORKSPACE
+    contact: Literal["rigid", "scene"] = "rigid"
+
+
+DEFAULT_USE = IntendedUse()
+"""Default run on the largest table-top device."""
+
+
 def open_case(
     source: SceneSource,
     grip: str = "grip",
+    use: IntendedUse = DEFAULT_USE,
     *,
-    coupling: Coupling | None = None,
-    period: float | None = None,
-    scale: float = 1.0,
-    workspace: float = LARGEST_WORKSPACE,
     motion: str | Path | None = None,
-    contact: Literal["rigid", "scene"] = "rigid",
     progress: Callable[[int, int], None] | None = None,
 ) -> SceneUnderCheck:
     """Compiles a scene and leads it through its motion.
@@ -247,13 +182,9 @@ def open_case(
     Args:
         source: Scene from ``read_scene``; it is not changed.
         grip: Name of the site on the tool.
-        coupling: Requested K and B; None takes the default of the simulated device.
-        period: T in s; None takes ``DEFAULT_PERIOD``.
-        scale: Handle motion per device motion.
-        workspace: Edge in m of the cube that the device reaches, > 0.
+        use: Device and run for which the scene is checked.
         motion: CSV file or recording. None takes ``NAME.csv`` beside the scene, or else the default
             hand motion of ``hapticbridge run``.
-        contact: Contact of the run: ``rigid``, its default, or ``scene``, MuJoCo's own.
         progress: Called with the number of ticks done and the total.
 
     Raises:
@@ -262,10 +193,11 @@ def open_case(
         DeviceError: The motion cannot be read, or the period, scale or workspace is out of range.
         RecordingError: The recording cannot be read.
     """
-    checked_number("workspace", workspace, "m", is_positive=True)
-    has_chosen_period, period = period is not None, DEFAULT_PERIOD if period is None else period
+    checked_number("workspace", use.workspace, "m", is_positive=True)
+    period = DEFAULT_PERIOD if use.period is None else use.period
     info = SimulatedDevice().info
-    coupling = coupling or default_coupling(info, period, scale, scale)
+    coupling = use.coupling or default_coupling(info, period, use.scale, use.scale)
+    setting = Setting(coupling, period, contact=use.contact)
     scene, refused = _compile(source, grip)
     chosen = motion_for(scene, motion)
     name = str(motion) if motion is not None else scene.path.with_suffix(".csv").name
@@ -279,9 +211,7 @@ def open_case(
     observation, fault = None, ""
     try:
         with quiet():
-            observation = observe(
-                scene, samples, Setting(coupling, period, contact=contact), progress
-            )
+            observation = observe(scene, samples, setting, progress)
         if observation.force.size < samples.size:
             samples = samples[: observation.force.size]
             name += f"; of this heavy scene the first {samples.size * period:.2g} s alone"
@@ -296,16 +226,16 @@ def open_case(
         info=info,
         coupling=coupling,
         period=period,
-        scale=scale,
+        scale=use.scale,
         motion=chosen,
         motion_name=name,
         samples=samples,
         refused=refused,
-        workspace=workspace,
-        has_chosen_period=has_chosen_period,
+        workspace=use.workspace,
+        has_chosen_period=use.period is not None,
         observation=observation,
         motion_fault=fault,
-        contact=contact,
+        contact=use.contact,
     )
 
 

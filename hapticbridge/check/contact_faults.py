@@ -7,9 +7,8 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from hapticbridge.check.case import Fault, SceneUnderCheck, length, number, numbers, others
+from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.observe import clearances
-from hapticbridge.check.source_map import Place
 from hapticbridge.kernel.colliders import MAX_VERTICES
 from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION
 from hapticbridge.scene.compile import START_KEYFRAME
@@ -25,7 +24,9 @@ from hapticbridge.scene.contacts import (
     suggested_solref,
     tool_geoms,
 )
+from hapticbridge.scene.fault import Fault, length, number, numbers, others
 from hapticbridge.scene.physics import body_inertia, constraint_stiffness, depth_under
+from hapticbridge.scene.source_map import Place
 
 MIN_PUSH = 1.0
 """Smallest force in N that contacts are tested with: a light touch. A motion without contact does
@@ -69,12 +70,9 @@ def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         if fault := _soft(case, setting, pairs, push, rooms, active):
             yield fault
         for concern in contact_concerns(
-            setting.solref,
-            setting.solimp,
+            setting,
             case.step,
             cone="elliptic" if option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else "pyramidal",
-            condim=setting.condim,
-            friction=setting.friction,
             only_active=True,
         ):
             clause, change, is_cone = concern

@@ -12,10 +12,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.case import Fault, SceneUnderCheck
-from hapticbridge.check.observe import Setting, not_finite, rehearsal_parameters
+from hapticbridge.check.case import SceneUnderCheck
+from hapticbridge.check.observe import not_finite
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.clock import LOWEST_RATE
+from hapticbridge.demand.rehearsal import Setting, rehearsal_parameters
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import OK
@@ -28,6 +29,7 @@ from hapticbridge.plotting import new_figure
 from hapticbridge.recording import TAIL, Ring
 from hapticbridge.recording.recorder import NOBODY_READS
 from hapticbridge.scene import Scene
+from hapticbridge.scene.fault import Fault
 from hapticbridge.units import format_si
 
 if TYPE_CHECKING:

@@ -5,36 +5,32 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from hapticbridge.check.case import CompiledScene, Fault, SceneUnderCheck
-from hapticbridge.check.constraint_faults import constraint_faults, friction_faults
+from hapticbridge.check.case import SceneUnderCheck
+from hapticbridge.check.constraint_faults import constraint_faults
 from hapticbridge.check.contact_faults import (
     contact_faults,
     margin_faults,
     shape_faults,
     start_faults,
 )
-from hapticbridge.check.drive_faults import motor_faults, pump_faults, strongest_motor
-from hapticbridge.check.geometry_faults import (
-    UNITS,
-    angle_faults,
-    grip_faults,
-    mesh_faults,
-    unit_faults,
-    workspace_faults,
-)
+from hapticbridge.check.geometry_faults import grip_faults, mesh_faults, workspace_faults
 from hapticbridge.check.mass_faults import mass_faults
-from hapticbridge.check.own_motion import own_motion
 from hapticbridge.check.run_faults import run_faults
-from hapticbridge.check.source_map import Places
 from hapticbridge.errors import choices
-from hapticbridge.scene import Scene, SceneSource, compile_scene
+from hapticbridge.run.own_motion import own_motion
+from hapticbridge.scene import compile_scene
 from hapticbridge.scene.checks import check_model, first_pump
 from hapticbridge.scene.compile import START_KEYFRAME
+from hapticbridge.scene.fault import Fault
+from hapticbridge.scene.first_faults import (
+    UNITS,
+    angle_faults,
+    motor_faults,
+    pump_faults,
+    unit_faults,
+)
 
 # Faults of options, start, and motion without a hand
-
-_OWN_FAULT = "integrator:", "solver:", "start where"  # changes with a fault of their own
-
 
 _SAME_STEP = 1e-9  # relative: 0.001 as 1/1000
 
@@ -43,7 +39,7 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields a time step that is not the run's, and concerns from loading the scene.
 
     Integrator, solver and flags that a run needs are set when the scene is loaded
-    (``Scene.changes``), so that they are no faults.
+    (``Scene.differences``), so that they are no faults.
     """
     option, places = case.source.spec.option, case.places
     step = float(option.timestep)
@@ -57,8 +53,8 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             f"{1 / step:g}",
             is_note=True,
         )
-    for change in case.scene.changes:
-        if not change.startswith(_OWN_FAULT):
+    for change in case.scene.differences:
+        if not change.kind:  # those of a kind have a fault of their own
             yield Fault(
                 "changed",
                 places.option("integrator"),
@@ -125,20 +121,6 @@ RULES = (
     run_faults,
 )
 """Functions that yield the faults of one subject, in the best order for mending."""
-
-AT_ONCE = (unit_faults, pump_faults, strongest_motor, angle_faults, friction_faults)
-"""Rules on faults that are felt from the first second, and seen without a motion."""
-
-
-def worst_faults(source: SceneSource, scene: Scene) -> Iterator[Fault]:
-    """Yields faults that make a run feel wrong from its first second.
-
-    They need no motion, so that a run can tell them at its start. The scene is reset.
-    """
-    loaded = CompiledScene(source, scene, Places(source, scene.model))
-    for rule in AT_ONCE:
-        scene.reset()
-        yield from rule(loaded)
 
 
 def find_faults(case: SceneUnderCheck) -> tuple[Fault, ...]:

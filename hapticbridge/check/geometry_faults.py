@@ -8,38 +8,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.case import (
-    CompiledScene,
-    Fault,
-    SceneUnderCheck,
-    length,
-    number,
-    weight,
-)
+from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.inventory import VISUAL, geom_uses
-from hapticbridge.check.source_map import Place
+from hapticbridge.scene.fault import Fault, length, number
+from hapticbridge.scene.first_faults import tool_extent
 from hapticbridge.scene.physics import (
     mesh_of,
 )
-
-UNITS = "units"
-"""Kind of the fault of a tool whose sizes or masses no hand could hold."""
-
-
-LARGEST_TOOL, HEAVIEST_TOOL = 3.0, 50.0
-"""Length in m and mass in kg above which no hand holds a tool, so that wrong units are
-suspected."""
-
-
-NARROWEST_RANGE = np.radians(np.pi)
-"""Range of a hinge in rad up to which radians read as degrees are suspected: ±π/2 written so. A
-hinge that truly turns less is rarely given limits."""
-
-
-WIDEST_TURN = 8 * np.pi
-"""Limit of a hinge in rad beyond which degrees read as radians are suspected: four turns to a side,
-more than any hand makes."""
-
+from hapticbridge.scene.source_map import Place
 
 DEEPEST_DENT = 0.02
 """Depth of a mesh's dent below its convex hull, relative to the mesh's largest extent, without
@@ -55,63 +31,6 @@ _AT_ONCE = 1000  # triangles per block; about 100 MB with a hull of 10 000 facet
 
 
 _SMALLEST_EXTENT = 1e-3  # m; a grip nearer than this counts as on the tool
-
-
-def unit_faults(case: CompiledScene) -> Iterator[Fault]:
-    """Yields a tool that no hand could hold: its units are probably wrong."""
-    model = case.model
-    tool_bodies = case.tool_bodies
-    mass, extent = float(model.body_mass[tool_bodies].sum()), float(_tool_extent(case).max())
-    found = []
-    if extent > LARGEST_TOOL:
-        found.append(f"is {length(extent)} long")
-    if mass > HEAVIEST_TOOL:
-        found.append(f"weighs {weight(mass)}")
-    if not found:
-        return
-    meshes = [
-        int(model.geom_dataid[geom])
-        for geom in range(model.ngeom)
-        if tool_bodies[model.geom_bodyid[geom]]
-        and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
-    ]
-    body = int(model.body_rootid[model.site(case.scene.grip).bodyid[0]])
-    place = case.places.mesh(meshes[0]) if meshes else case.places.body(body)
-    change = 'scale="0.001 0.001 0.001"' if meshes else "its sizes and positions in m, kg"
-    yield Fault(
-        UNITS,
-        place,
-        f"the tool {' and '.join(found)}: are these millimetres or grams? MuJoCo counts in m and "
-        "kg",
-        change,
-    )
-
-
-def angle_faults(case: CompiledScene) -> Iterator[Fault]:
-    """Yields ranges of hinges whose unit is not that of the compiler."""
-    model, is_degree = case.model, bool(case.source.spec.compiler.degree)
-    for joint in range(model.njnt):
-        is_hinge = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
-        if not is_hinge or not model.jnt_limited[joint]:
-            continue
-        low, high = (float(limit) for limit in model.jnt_range[joint])
-        place = case.places.joint(joint)
-        if is_degree and high - low <= NARROWEST_RANGE:
-            written = f"{number(np.degrees(low))} to {number(np.degrees(high))}"
-            yield Fault(
-                "angle unit",
-                place,
-                f"{place.element} turns from {written} degrees; are these radians?",
-                '<compiler angle="radian"/> in <mujoco>',
-            )
-        elif not is_degree and max(abs(low), abs(high)) > WIDEST_TURN:
-            yield Fault(
-                "angle unit",
-                place,
-                f"{place.element} turns from {number(low)} to {number(high)} radians, which is "
-                f"{number(max(abs(low), abs(high)) / (2 * np.pi))} turns; are these degrees?",
-                'a range in radians, or <compiler angle="degree"/> in <mujoco>',
-            )
 
 
 def mesh_faults(case: SceneUnderCheck) -> Iterator[Fault]:
@@ -182,7 +101,7 @@ def grip_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     centre = mass @ scene.data.xipos[tool_bodies] / mass.sum()
     grip = scene.data.site_xpos[site]
     distance = float(np.linalg.norm(grip - centre))
-    extent = max(float(np.linalg.norm(_tool_extent(case))), _SMALLEST_EXTENT)
+    extent = max(float(np.linalg.norm(tool_extent(case))), _SMALLEST_EXTENT)
     if distance <= FARTHEST_GRIP * extent:
         return
     rotation = scene.data.xmat[body].reshape(3, 3)
@@ -213,22 +132,3 @@ def workspace_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         f"{length(case.workspace)}",
         f"a smaller scene, or run it with --scale {np.ceil(100 * scale) / 100:g}",
     )
-
-
-def _tool_extent(case: CompiledScene) -> NDArray[np.float64]:
-    """Returns the edges in m of the axis-aligned box around the tool's geoms at the start."""
-    model, scene = case.model, case.scene
-    scene.reset()
-    tool_bodies = case.tool_bodies
-    corners = []
-    for geom in range(model.ngeom):
-        if (
-            tool_bodies[model.geom_bodyid[geom]]
-            and model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE
-        ):
-            centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-            rotation = scene.data.geom_xmat[geom].reshape(3, 3)
-            middle = scene.data.geom_xpos[geom] + rotation @ centre
-            reach = np.abs(rotation) @ half
-            corners += [middle - reach, middle + reach]
-    return np.ptp(corners, axis=0) if corners else np.zeros(3)

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.check.observe import Observation, reached_trees
-from hapticbridge.check.source_map import Place, Places
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE
 from hapticbridge.scene.contacts import meeting_pairs
+from hapticbridge.scene.source_map import Place, Places
 
 VISUAL = "only visual"
 TOOL = "of the tool"

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from hapticbridge.arguments import Arguments
 from hapticbridge.check.cost import CostMeter, processor_costs
-from hapticbridge.check.observe import Playback, Setting
+from hapticbridge.check.observe import Playback
 from hapticbridge.check.perception import FeltError, felt_error
 from hapticbridge.check.simplify import (
     OTHER_MOTIONS,
@@ -28,7 +29,6 @@ from hapticbridge.demand.certificate import UNKNOWN_DAMPING
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.kernel.mujoco_c import quiet
-from hapticbridge.scene import SceneSource
 
 # Judgement of one version of a scene
 
@@ -86,6 +86,13 @@ class VariantVerdict:
         return 100.0 * (self.cost or 1.0)
 
 
+class CheaperVariant(NamedTuple):
+    """A version, and its cost relative to the original, without unit."""
+
+    draft: SceneVariant
+    share: float = 1.0
+
+
 class Judge:
     """Comparison of versions of one scene in one motion.
 
@@ -125,8 +132,7 @@ class Judge:
         name: str,
         sentence: str,
         draft: SceneVariant,
-        base: SceneVariant | None = None,
-        share: float = 1.0,
+        base: CheaperVariant | None = None,
         loses: str = "",
         *,
         is_last_word: bool = False,
@@ -138,13 +144,13 @@ class Judge:
             sentence: Description of the change.
             draft: The version.
             base: Version that it must be cheaper than; None takes the original.
-            share: Cost of ``base`` relative to the original, without unit.
             loses: Further loss, see ``Simplification``.
             is_last_word: True measures the cost thoroughly even if a single run shows no saving.
 
         Raises:
             SceneError: The version does not compile, or a result is not finite.
         """
+        rival, share = base or CheaperVariant(self.original)
         done = draft.rehearsed(self.motion)
         error = felt_error(self.rehearsal.records, done.records)
         needed = draft.setting.needed_damping
@@ -153,7 +159,7 @@ class Judge:
         if not verdict and not is_last_word and cost > CLEARLY_MORE * share:
             verdict = SAVES_NOTHING
         if not verdict:  # a refused version needs no thorough measurement
-            before, after = self._cost(base or self.original, draft, self.motion)
+            before, after = self._cost(rival, draft, self.motion)
             verdict = MAY_GO if after <= (1.0 - self.min_saving) * before else SAVES_NOTHING
             cost = share * after / before
         return VariantVerdict(
@@ -223,10 +229,8 @@ class Lean:
 
 
 def find_lean(
-    source: SceneSource,
-    grip: str,
+    original: SceneVariant,
     motion: Motion,
-    setting: Setting,
     *,
     budget: float = 1.0,
     device_damping: float = UNKNOWN_DAMPING,
@@ -236,10 +240,8 @@ def find_lean(
     """Finds the leanest version of a scene that feels the same in a motion.
 
     Args:
-        source: The scene; it is not changed.
-        grip: Name of the site on the tool.
+        original: The scene with grip, coupling and rate; it is not changed.
         motion: Motion of the handle, relative to its first pose.
-        setting: Coupling and rate.
         budget: Allowed felt error in just noticeable differences, > 0.
         device_damping: b of the device in N s/m. A rate whose coupling needs more than b, and more
             than the original needs, is refused.
@@ -252,13 +254,13 @@ def find_lean(
     """
     budget = checked_budget(budget)
     damping = _ARGUMENTS.number("device damping", device_damping, "N s/m", least=0.0)
-    if motion.duration < setting.period:
+    period = original.setting.period
+    if motion.duration < period:
         raise SceneError(
-            f"the motion lasts {motion.duration:g} s, less than one tick of {setting.period:g} s"
+            f"the motion lasts {motion.duration:g} s, less than one tick of {period:g} s"
         )
-    spec = source.spec.copy()
-    name_everything(spec)
-    original = SceneVariant(replace(source, spec=spec), grip, setting)
+    original = original.copy()
+    name_everything(original.source.spec)
     with quiet():
         judge = Judge(original, motion, budget, damping, cost)
         return _search(judge, all_simplifications(original, motion), progress)
@@ -281,39 +283,39 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
     progress = progress or (lambda _done, _total, _name: None)
     for k, each in enumerate(simpler):
         progress(k, total, each.name)
-        if (found := _apply(judge, each, judge.original)) is not None:
+        if (found := _apply(judge, each, CheaperVariant(judge.original))) is not None:
             alone.append((each, found[1]))
     # a small saving of the whole may be a large share of the rest
     order = [pair for pair in alone if pair[1].verdict in (MAY_GO, SAVES_NOTHING)]
     order = [pair for pair in order if (pair[1].cost or 0.0) < 1.0 + judge.min_saving]
     # simplifications for this motion alone go last; they may turn out not to be needed
     order.sort(key=lambda pair: (pair[0].loses == OTHER_MOTIONS, pair[1].cost or 0.0))
-    best, share, together = judge.original, 1.0, []
+    best, together = CheaperVariant(judge.original), []
     for k, (each, _) in enumerate(order):
         progress(len(simpler) + k, total, each.name)
-        found = _apply(judge, each, best, share)
+        found = _apply(judge, each, best)
         if found is not None and found[1].verdict == MAY_GO:
-            best, share = found[0], found[1].cost or share
+            best = CheaperVariant(found[0], found[1].cost or best.share)
             together.append(found[1])
-    result = judge.judge("lean", "all that was taken", best, is_last_word=True)
+    result = judge.judge("lean", "all that was taken", best.draft, is_last_word=True)
     if together and result.verdict != MAY_GO:  # the steps' savings were timing noise
-        best, together = judge.original, []
-        result = judge.judge("lean", "all that was taken", best)
+        best, together = CheaperVariant(judge.original), []
+        result = judge.judge("lean", "all that was taken", best.draft)
     if not together:
         result = replace(result, cost=1.0)  # not measured against itself
     progress(total, total, "")
-    return Lean(judge, best, tuple(trial for _, trial in alone), tuple(together), result)
+    return Lean(judge, best.draft, tuple(trial for _, trial in alone), tuple(together), result)
 
 
 def _apply(
-    judge: Judge, each: Simplification, base: SceneVariant, share: float = 1.0
+    judge: Judge, each: Simplification, base: CheaperVariant
 ) -> tuple[SceneVariant, VariantVerdict] | None:
     """Applies a simplification to a version; returns None if there is nothing to change."""
-    draft = base.copy()
+    draft = base.draft.copy()
     try:
         if not each.edit(draft):
             return None
-        return draft, judge.judge(each.name, each.sentence, draft, base, share, each.loses)
+        return draft, judge.judge(each.name, each.sentence, draft, base, each.loses)
     except (HapticBridgeError, ValueError) as error:  # MuJoCo raises ValueError
         reason = " ".join(str(error).split())
         return draft, VariantVerdict(each.name, reason, FAILS, each.loses)

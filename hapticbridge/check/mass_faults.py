@@ -8,16 +8,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hapticbridge.check.case import (
-    STAND_IN_INERTIA,
-    STAND_IN_MASS,
-    Fault,
-    SceneUnderCheck,
-    length,
-    number,
-    others,
-    weight,
-)
+from hapticbridge.check.case import STAND_IN_INERTIA, STAND_IN_MASS, SceneUnderCheck
+from hapticbridge.scene.fault import Fault, length, number, others, weight
 from hapticbridge.scene.physics import (
     body_inertia,
 )

@@ -5,20 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.coupling import Coupling
-from hapticbridge.demand.loop_setting import required_damping
-from hapticbridge.demand.methods import RIGID, default_method, unguarded_parameters
+from hapticbridge.demand.methods import RIGID
+from hapticbridge.demand.rehearsal import Setting, rehearsal_parameters
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import OK, WARNINGS, warning_words
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.mujoco_c import warning_of
-from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.rigid_contact import DEPENETRATION, SOFTNESS
 from hapticbridge.kernel.state import BoundKernel
@@ -186,30 +183,6 @@ class Playback:
     seconds: float
 
 
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """Coupling and rate at which a scene is run.
-
-    Attributes:
-        coupling: Requested K and B.
-        period: T in s.
-        substeps: MuJoCo steps per tick.
-        contact: ``rigid``, the default of a run, or ``scene``, MuJoCo's own.
-    """
-
-    coupling: Coupling
-    period: float = 1e-3
-    substeps: int = 1
-    contact: Literal["rigid", "scene"] = "rigid"
-
-    @property
-    def needed_damping(self) -> float:
-        """Device damping in N s/m required by the default method."""
-        method = default_method(self.substeps)
-        used = method.law_coupling(self.coupling, self.period / self.substeps)
-        return required_damping(used, self.period, method.law_evaluations(self.substeps))
-
-
 def rehearse(scene: Scene, samples: NDArray[np.void], setting: Setting) -> Playback:
     """Runs the scene from its start as the bridge would, one tick per sample.
 
@@ -252,21 +225,6 @@ def not_finite(scene: Scene, tick: int, ticks: int) -> SceneError:
     return SceneError(
         f"scene '{scene.name}' is not finite after tick {tick} of {ticks} of the motion"
     )
-
-
-def rehearsal_parameters(scene: Scene, setting: Setting) -> RunParameters:
-    """Resets a scene for the default method, and returns the parameters.
-
-    Raises:
-        SceneError: A value is out of range.
-    """
-    substeps = setting.substeps
-    method = default_method(substeps).with_contact(setting.contact)
-    parameters = unguarded_parameters(scene, setting.coupling, setting.period, substeps, method)
-    # an error inside the C function would end the process; the first step in Python raises instead
-    mujoco.mj_step(scene.model, scene.data)
-    scene.reset()
-    return parameters
 
 
 _TYPE = mujoco.mjtConstraint

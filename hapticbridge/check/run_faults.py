@@ -7,9 +7,10 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from hapticbridge.check.case import Fault, SceneUnderCheck, number
+from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.observe import Observation
 from hapticbridge.scene.contacts import suggested_solref
+from hapticbridge.scene.fault import Fault, number
 
 ITERATIONS = 100
 """MuJoCo's default limit of solver iterations. Newton's solver takes 1 to 8 in the shipped

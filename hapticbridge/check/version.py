@@ -10,15 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.check.case import samples_of
-from hapticbridge.check.observe import (
-    WITHOUT_DISTANCE,
-    Playback,
-    Setting,
-    may_be_near,
-    not_finite,
-    rehearsal_parameters,
-    rehearse,
-)
+from hapticbridge.check.observe import WITHOUT_DISTANCE, Playback, may_be_near, not_finite, rehearse
+from hapticbridge.demand.rehearsal import Setting, rehearsal_parameters
 from hapticbridge.device import Motion
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel

@@ -18,12 +18,9 @@ from hapticbridge.arguments import option, shared
 from hapticbridge.check.case import (
     DEFAULT_PERIOD,
     LARGEST_WORKSPACE,
-    Fault,
+    IntendedUse,
     SceneUnderCheck,
-    length,
     open_case,
-    others,
-    weight,
 )
 from hapticbridge.check.cost import TICK_SHARE, Cost, Growth, draw_cost, measure_cost
 from hapticbridge.check.findings import find_faults
@@ -38,6 +35,7 @@ from hapticbridge.check.lean import (
 )
 from hapticbridge.check.lean_output import check_target, lean_facts, write_lean
 from hapticbridge.check.simplify import OTHER_MOTIONS
+from hapticbridge.check.version import SceneVariant
 from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
@@ -50,6 +48,7 @@ from hapticbridge.plotting import check_ending, write_picture
 from hapticbridge.run.hands import Grasp
 from hapticbridge.run.options import BridgeOptions, Workspace
 from hapticbridge.scene import plain_model, read_scene, settings_from
+from hapticbridge.scene.fault import Fault, length, others, weight
 from hapticbridge.units import format_si
 
 _HEADINGS = ("alone", "cost", "JND", "tool force, RMS", "peak", "tool torque, RMS", "tool off by")
@@ -364,12 +363,14 @@ class Check:
             case = open_case(
                 source,
                 self.grip,
-                coupling=self._coupling(period or DEFAULT_PERIOD),
-                period=period,
-                scale=self.scale,
-                workspace=self.workspace,
+                IntendedUse(
+                    coupling=self._coupling(period or DEFAULT_PERIOD),
+                    period=period,
+                    scale=self.scale,
+                    workspace=self.workspace,
+                    contact=self.contact,
+                ),
                 motion=self.motion,
-                contact=self.contact,
                 progress=show,
             )
         inventory = take_inventory(case.model, self.grip, case.places, case.observation)
@@ -407,10 +408,8 @@ class Check:
         try:
             with progress("leaner") as show:
                 return find_lean(
-                    case.source,
-                    case.scene.grip,
+                    SceneVariant(case.source, case.scene.grip, case.setting),
                     case.motion,
-                    case.setting,
                     budget=budget,
                     device_damping=(case.info.damping or 0.0) / case.scale**2,
                     progress=show,

@@ -16,10 +16,6 @@ import numpy as np
 from rich.markup import escape
 
 from hapticbridge.arguments import option, shared
-from hapticbridge.check.case import DEFAULT_SECONDS
-from hapticbridge.check.findings import worst_faults
-from hapticbridge.check.observe import Setting
-from hapticbridge.check.own_motion import NO_HAND, own_substeps
 from hapticbridge.cli.terminal import compiling, err, notify, out, plain, print_json
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
@@ -31,9 +27,11 @@ from hapticbridge.demand.certificate import (
 from hapticbridge.demand.guard import refuse_simulated_time
 from hapticbridge.demand.loop_setting import device_period
 from hapticbridge.demand.methods import RunCoupling, default_method
+from hapticbridge.demand.rehearsal import Setting
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.base import checked_close
 from hapticbridge.device.mouse import MouseDevice
+from hapticbridge.device.trajectory import DEFAULT_SECONDS
 from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, choices
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
@@ -47,6 +45,7 @@ from hapticbridge.run.options import (
     steady_rotational_stiffness,
     steady_stiffness,
 )
+from hapticbridge.run.own_motion import NO_HAND, own_substeps
 from hapticbridge.run.programs import prepare_run, words
 from hapticbridge.run.summary import WELD, Summary, coarse_spring, is_always_implicit
 from hapticbridge.scene import (
@@ -58,6 +57,7 @@ from hapticbridge.scene import (
     settings_from,
 )
 from hapticbridge.scene.compile import custom_text
+from hapticbridge.scene.first_faults import worst_faults
 from hapticbridge.scene.rehearsal import static_load
 from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
 from hapticbridge.units import format_si

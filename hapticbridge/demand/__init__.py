@@ -4,5 +4,5 @@ Read ``loop_setting`` first: device, law, period and scales as the theory sees t
 the ways to couple a tool. ``certificate`` has the conditions on damping and friction, and the
 default coupling that meets them; ``plots`` draws their bounds. ``guard`` sets the limits of the
 loop, ``trip`` is its stop of a run. ``timekeeping`` judges the conditions at the times of a run,
-``certification`` is the verdict on the device in words.
+``certification`` is the verdict on the device in words. ``rehearsal`` is a run without device.
 """

@@ -131,6 +131,7 @@ class FoundDevice:
         vendor: USB vendor id; 0 if unknown.
         product: USB product id; 0 if unknown.
         problem: Reason why it cannot be opened, with the remedy, in one sentence; None if it can.
+        lacks_permission: True if this user may not open it, which is then its problem.
     """
 
     driver: str
@@ -141,13 +142,11 @@ class FoundDevice:
     vendor: int = 0
     product: int = 0
     problem: str | None = None
-
-    @property
-    def lacks_permission(self) -> bool:
-        """True if this user may not open it."""
-        return self.problem == permission_problem(self.path)
+    lacks_permission: bool = False
 
     def __post_init__(self) -> None:
+        if self.lacks_permission:
+            object.__setattr__(self, "problem", permission_problem(self.path))
         for field in ("name", "serial"):
             object.__setattr__(self, field, printable(getattr(self, field)))
 
@@ -170,13 +169,18 @@ def permission_problem(path: str) -> str:
     )
 
 
+def is_refused(path: str) -> bool:
+    """Returns True if this user may not open a node of the kernel that exists."""
+    return Path(path).exists() and not os.access(path, os.R_OK | os.W_OK)
+
+
 def access_problem(path: str) -> str | None:
     """Returns the reason why this user cannot open a node of the kernel; None if there is none."""
-    if os.access(path, os.R_OK | os.W_OK):
-        return None
-    if not Path(path).exists():
+    if is_refused(path):
+        return permission_problem(path)
+    if not os.access(path, os.R_OK | os.W_OK):
         return f"no node {path} exists yet, or none in this container; try again in a second"
-    return permission_problem(path)
+    return None
 
 
 def select_device(

@@ -507,7 +507,10 @@ def find() -> list[FoundDevice]:
     try:
         return _listed(Dhd(FILES.located()))
     except DeviceError as error:
-        return [replace(device, problem=str(error)) for device in usb_search.find(DRIVER)]
+        return [
+            replace(device, problem=str(error), lacks_permission=False)
+            for device in usb_search.find(DRIVER)
+        ]
 
 
 def medium() -> str:

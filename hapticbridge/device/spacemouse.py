@@ -6,8 +6,8 @@ import contextlib
 import math
 import struct
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,6 +157,36 @@ Not verified on hardware."""
 _TO_BRIDGE = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
 
 
+@dataclass(frozen=True, slots=True)
+class RateControl:
+    """Motion that a deflection sets.
+
+    Attributes:
+        speed: Speed in m/s at full deflection of one axis, > 0.
+        turn: Turn rate in rad/s at full deflection of one axis, > 0.
+        dead_band: Share of full deflection that counts as rest, 0 <= dead_band < 1.
+
+    Raises:
+        DeviceError: A number is out of range.
+    """
+
+    speed: float = SPEED
+    turn: float = TURN
+    dead_band: float = DEAD_BAND
+
+    def __post_init__(self) -> None:
+        checked_number("speed", self.speed, "m/s", is_positive=True)
+        checked_number("turn", self.turn, "rad/s", is_positive=True)
+        if checked_number("dead_band", self.dead_band, "of full deflection") >= 1.0:
+            raise DeviceError(
+                f"dead_band is {self.dead_band!r}; it must be below 1, which is full scale"
+            )
+
+
+DEFAULT_CONTROL = RateControl()
+"""Usual speeds."""
+
+
 class SpaceMouseDevice:
     """A handle that moves while the puck is deflected, at a proportional speed.
 
@@ -170,9 +200,7 @@ class SpaceMouseDevice:
     Args:
         link: Open link for its reports.
         name: Name of the device.
-        speed: Speed in m/s at full deflection of one axis, > 0.
-        turn: Turn rate in rad/s at full deflection of one axis, > 0.
-        dead_band: Share of full deflection that counts as rest, 0 <= dead_band < 1.
+        control: Motion that a deflection sets.
         force_limit: Force limit of the data sheet in N, >= 0; it limits the recorded wrench.
         torque_limit: Torque limit of the data sheet in N m, >= 0; it limits the recorded wrench.
 
@@ -184,28 +212,19 @@ class SpaceMouseDevice:
         self,
         link: HidLink,
         name: str = "spacemouse",
+        control: RateControl = DEFAULT_CONTROL,
         *,
-        speed: float = SPEED,
-        turn: float = TURN,
-        dead_band: float = DEAD_BAND,
         force_limit: float = USUAL_FORCE_LIMIT,
         torque_limit: float = USUAL_TORQUE_LIMIT,
     ) -> None:
-        self._link, self._name = link, name
-        speed = checked_number("speed", speed, "m/s", is_positive=True)
-        turn = checked_number("turn", turn, "rad/s", is_positive=True)
-        self._full = _TO_BRIDGE * np.repeat([speed, turn], 3)
-        self._dead_band = checked_number("dead_band", dead_band, "of full deflection")
-        if self._dead_band >= 1.0:
-            raise DeviceError(
-                f"dead_band is {dead_band!r}; it must be below 1, which is full scale"
-            )
+        self._link, self._name, self._control = link, name, control
+        self._full = _TO_BRIDGE * np.repeat([control.speed, control.turn], 3)
         self.info = DeviceInfo(
             name=name,
             axes=AXES,
             force_limit=force_limit,
             torque_limit=torque_limit,
-            speed_limit=math.sqrt(3.0) * speed,  # all three axes at full deflection
+            speed_limit=math.sqrt(3.0) * control.speed,  # all three axes at full deflection
             is_prescribed=True,
             is_real=False,
         )
@@ -264,7 +283,7 @@ class SpaceMouseDevice:
         news = decoded(report)
         if isinstance(news, Deflection):
             last = news.first + len(news.counts)
-            shares = [share(count, self._dead_band) for count in news.counts]
+            shares = [share(count, self._control.dead_band) for count in news.counts]
             self._rate[news.first : last] = self._full[news.first : last] * shares
             self._silence = 0.0
         elif isinstance(news, Buttons):
@@ -286,19 +305,17 @@ def open_spacemouse(
     options: Mapping[str, object], _notify: Notify, api: HidApi | None = None
 ) -> SpaceMouseDevice:
     """Finds and opens a SpaceMouse; options are ``serial``, ``log`` and numbers of the device."""
-    numbers: dict[str, float] = {
-        key: value  # type: ignore[misc] # checked by the device
-        for key, value in options.items()
-        if key in _NUMBERS
-    }
+    numbers: dict[str, Any] = dict(options)  # checked by the device
+    control = RateControl(**{name: numbers[name] for name in _CONTROL if name in numbers})
+    limits = {name: numbers[name] for name in _LIMITS if name in numbers}
     # not overlapped: reports are written only before and after the loop
     with opened(DRIVER, options, api, is_overlapped=False) as (plugged, link):
-        device = SpaceMouseDevice(link, plugged.name, **numbers)
+        device = SpaceMouseDevice(link, plugged.name, control, **limits)
     device.info = replace(device.info, serial=plugged.serial)
     return device
 
 
-_NUMBERS = ("speed", "turn", "dead_band", "force_limit", "torque_limit")
+_CONTROL, _LIMITS = ("speed", "turn", "dead_band"), ("force_limit", "torque_limit")
 
 DRIVER = Driver(
     name="spacemouse",
@@ -308,6 +325,6 @@ DRIVER = Driver(
     axes="6; deflection sets velocity",
     force="none (input only)",
     rate="about 125 Hz",
-    options={"serial": str, "log": str, **dict.fromkeys(_NUMBERS, float)},
+    options={"serial": str, "log": str, **dict.fromkeys((*_CONTROL, *_LIMITS), float)},
     open=open_spacemouse,
 )

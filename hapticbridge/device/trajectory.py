@@ -200,6 +200,8 @@ LISSAJOUS_ROTATION = 0.1
 """Amplitude of the default motion about each axis in rad."""
 LISSAJOUS_EASE = 2.0
 """Time in s in which the default motion grows from rest to its full amplitude."""
+DEFAULT_SECONDS = 5.0
+"""Duration in s of the default hand motion, which reaches its full size after 2 s."""
 _FREQUENCIES = (0.23, 0.31, 0.41, 0.17, 0.13, 0.19)
 """Frequencies of the default motion per axis in Hz: slow, without simple ratios."""
 

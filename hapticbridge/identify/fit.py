@@ -206,15 +206,26 @@ class Windows:
     mass_noise: float
 
 
-def windows(
-    position: Array,
-    force: Array,
-    period: float,
-    length: float,
-    resolution: float,
-    delay: float,
-    noise: float = 0.0,
-) -> Windows:
+@dataclass(frozen=True, slots=True, eq=False)
+class Trace:
+    """Motion of an axis under a force.
+
+    Attributes:
+        position: x in m (or an angle in rad) at the samples, shape (n,); NaN without a sample.
+        force: F in N (or N m), held from each sample to the next, shape (n,).
+        period: T in s.
+        resolution: Step of the position in m, 0 if it is exact.
+        noise: RMS of the position's noise in m, beyond its rounding; 0: none.
+    """
+
+    position: Array
+    force: Array
+    period: float
+    resolution: float
+    noise: float
+
+
+def windows(trace: Trace, length: float, delay: float) -> Windows:
     """Returns the equation of motion of a run, averaged over windows without differentiation.
 
     A free axis under a force F that acts with a delay d obeys
@@ -234,14 +245,11 @@ def windows(
     fourth order.
 
     Args:
-        position: x in m (or an angle in rad) at the samples, shape (n,).
-        force: F in N (or N m), held from each sample to the next, shape (n,).
-        period: T in s.
+        trace: The run.
         length: Length of a window in s; at least ``MIN_SAMPLES`` periods.
-        resolution: Step of the position in m, 0 if it is exact.
         delay: d in s, from a write until the force acts, >= 0.
-        noise: RMS of the position's noise in m, beyond its rounding; 0: none.
     """
+    position, force, period = trace.position, trace.force, trace.period
     count = max(round(length / period), MIN_SAMPLES)
     length = count * period
     nodes = np.arange(count + 1) / count
@@ -267,7 +275,7 @@ def windows(
         np.lib.stride_tricks.sliding_window_view(values, count + held)[begin - held]
         for values in (force, excess)
     )
-    trembling = math.sqrt(noise**2 + resolution**2 / 12.0)
+    trembling = math.sqrt(trace.noise**2 + trace.resolution**2 / 12.0)
     direction = _direction(x, trembling)
     moves = direction != 0.0
     x, f, e = x[moves], f[moves], e[moves]
@@ -388,9 +396,10 @@ def fit_axis(position: Array, force: Array, period: float, resolution: float = 0
         Shinbrot 1957, *On the analysis of linear and nonlinear systems* (modulating functions).
     """
     noise = noise_of(position, resolution)
+    trace = Trace(position, force, period, resolution, noise)
     best: AxisFit | None = None
     for length in LENGTHS:
-        fitted = _fitted(position, force, period, stretch(period) * length, resolution, noise)
+        fitted = _fitted(trace, stretch(period) * length)
         if fitted is not None and (best is None or _width(fitted) < _width(best)):
             best = fitted
     if best is not None:
@@ -411,11 +420,9 @@ def _width(fit: AxisFit) -> float:
     return sum((e.most - e.least) / max(abs(e.value), 1e-12) for e in (fit.mass, fit.damping))
 
 
-def _fitted(
-    position: Array, force: Array, period: float, length: float, resolution: float, noise: float
-) -> AxisFit | None:
+def _fitted(trace: Trace, length: float) -> AxisFit | None:
     def found_at(delay: float) -> Windows | None:
-        found = windows(position, force, period, length, resolution, delay, noise)
+        found = windows(trace, length, delay)
         is_usable = len(found.begin) >= MIN_WINDOWS and found.noise_share <= MAX_NOISE
         return found if is_usable else None
 

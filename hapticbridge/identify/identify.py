@@ -40,6 +40,7 @@ from hapticbridge.identify.fit import (
     MAX_DELAY,
     AxisFit,
     Estimate,
+    Trace,
     fit_axis,
     noise_of,
     windows,
@@ -97,11 +98,13 @@ class Allowance:
         travel: Distance from the start, to each side.
         force: Largest force or torque.
         speed: The device's own top speed.
+        duration: Length of the run in s.
     """
 
     travel: tuple[float, float]
     force: tuple[float, float]
     speed: tuple[float, float]
+    duration: float
 
 
 def move_axis(
@@ -110,7 +113,6 @@ def move_axis(
     axis: str,
     *,
     period: float,
-    duration: float,
     allowance: Allowance,
     progress: Callable[[float], None] | None = None,
 ) -> AxisRun:
@@ -124,8 +126,7 @@ def move_axis(
         clock: Started clock.
         axis: One of the device's axes.
         period: T in s.
-        duration: Length of the run in s.
-        allowance: Limits on travel, force and speed.
+        allowance: Limits on travel, force, speed and time.
         progress: Called ten times a second with the completed share.
 
     Raises:
@@ -133,7 +134,7 @@ def move_axis(
             for ``SILENCE``, or its pose is not finite.
         DeviceError: The device failed.
     """
-    ticks, index = round(duration / period), AXES.index(axis)
+    ticks, index = round(allowance.duration / period), AXES.index(axis)
     tones = signal(index, ticks, period)
     state, sample, wrench = np.zeros(1, STATE_DTYPE), np.zeros(1, SAMPLE_DTYPE), np.zeros(6)
     past = np.zeros((max(round(SPAN / period), 1), 6))
@@ -349,8 +350,8 @@ def identify(
         force=(force_share * info.force_limit, force_share * info.torque_limit),
         # rotation is limited to the device's speed at the rim of a handle of 50 mm diameter
         speed=(info.speed_limit, info.speed_limit / 0.025),
+        duration=duration_at(period) if duration is None else duration,
     )
-    duration = duration_at(period) if duration is None else duration
     device = checked(device)
     device.start(period)
     clock.start(round(period * 1e9))
@@ -361,13 +362,7 @@ def identify(
         for axis in chosen:
             report = None if progress is None else partial(progress, axis)
             runs[axis] = run = move_axis(
-                device,
-                clock,
-                axis,
-                period=period,
-                duration=duration,
-                allowance=allowance,
-                progress=report,
+                device, clock, axis, period=period, allowance=allowance, progress=report
             )
             try:
                 fits[axis] = _checked_fit(run, info)
@@ -501,8 +496,8 @@ def _draw_axis(panel: Axes, result: Identification, axis: str, fit: AxisFit) -> 
     run, colour = result.runs[axis], _COLOURS[axis[-1]]
     turns = len(axis) == 2
     step = 0.0 if turns else result.resolution or 0.0
-    noise = noise_of(run.position, step)
-    found = windows(run.position, run.force, run.period, fit.window, step, fit.delay.value, noise)
+    trace = Trace(run.position, run.force, run.period, step, noise_of(run.position, step))
+    found = windows(trace, fit.window, fit.delay.value)
     area = found.columns[:, 3]
     speed = found.columns[:, 1] / area
     rest = found.right / area - fit.mass.value * found.columns[:, 0] / area - fit.offset.value

@@ -16,6 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import IO, Any, Protocol, cast
@@ -129,6 +130,10 @@ run()
 # need. The explicit path loads this very package with any sys.path of the child.
 
 
+START_TIMEOUT = 30.0
+"""Longest time in s until the recorder's file is open. A busy machine takes seconds to start it."""
+
+
 class Recorder:
     """Starts the recorder's process and sends events to it without blocking the loop.
 
@@ -199,19 +204,17 @@ class Recorder:
             self._sender.start()
             self._is_started = True
 
-    def wait_until_ready(self, timeout: float = 30.0) -> None:
+    def wait_until_ready(self) -> None:
         """Waits until the file is open and has its metadata and attachments.
-
-        ``timeout`` is the longest wait in s.
 
         Raises:
             RecordingError: The file cannot be written, the process died, or the time is over.
         """
         try:
-            answer = self._answers.get(timeout=timeout)
+            answer = self._answers.get(timeout=START_TIMEOUT)
         except Empty:
             self.abort()
-            raise RecordingError(f"the recorder did not start within {timeout} s") from None
+            raise RecordingError(f"the recorder did not start within {START_TIMEOUT:g} s") from None
         if "ready" not in answer:
             raise self._failure(answer)
 
@@ -425,6 +428,22 @@ _ENDED = "the recorder ended during the run; the recording stops there"
 _FULL = "the disk is full; the recording ends here and is whole"
 
 
+@dataclass(frozen=True, slots=True)
+class RecordOutput:
+    """Destinations of a run's records.
+
+    Attributes:
+        path: File of the recording, overwritten if it exists; None records nothing.
+        observer: Second reader of the ring, such as ``view.Window``, for which the loop never
+            waits; None without one.
+        live: True shows the state of the run on standard error.
+    """
+
+    path: Path | None = None
+    observer: RingObserver | None = None
+    live: bool = False
+
+
 class RecordStream:
     """Records leave through a ring, events through a pipe; the loop never waits in real time.
 
@@ -433,13 +452,10 @@ class RecordStream:
     loop in any case.
 
     Args:
-        path: The recording, overwritten if it exists; None records nothing.
+        output: Destinations of the records.
         period: T in s, which determines the ring's capacity.
-        live: True shows the state of the run on standard error.
         may_wait: True if the loop may wait for the recorder (simulated time) instead of losing
             records.
-        observer: Optional second reader of the ring, such as the live view. The loop never waits
-            for it.
         snapshot: Name of the shared memory with the scene's positions, for the observer.
         hands: Number of hands; the ring has a record per hand of each tick, in order.
 
@@ -456,21 +472,19 @@ class RecordStream:
 
     def __init__(
         self,
-        path: Path | None,
+        output: RecordOutput,
         period: float,
         *,
-        live: bool,
         may_wait: bool,
-        observer: RingObserver | None = None,
         snapshot: str = "",
         hands: int = 1,
     ) -> None:
-        self._path, self._is_live, self._may_wait = path, live, may_wait
-        self._is_read = path is not None or live
+        self._path, self._is_live, self._may_wait = output.path, output.live, may_wait
+        self._is_read = output.path is not None or output.live
         self._hands = hands
         capacity = min(hands * round(RING_SECONDS / period), MAX_RECORDS) // hands * hands
-        self._observer, self._snapshot = observer, snapshot
-        is_shared = self._is_read or observer is not None
+        self._observer, self._snapshot = output.observer, snapshot
+        is_shared = self._is_read or output.observer is not None
         self._ring = Ring.shared(capacity) if is_shared else Ring.local(capacity)
         self.rows, self.cursors = self._ring.rows, self._ring.cursors
         if not self._is_read:

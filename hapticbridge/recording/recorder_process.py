@@ -297,7 +297,8 @@ class _Session:
             self._writer.write_event(event, time_ns)
 
 
-def _listen(stream: IO[bytes], inbox: SimpleQueue[dict[str, Any] | None]) -> None:
+def listen(stream: IO[bytes], inbox: SimpleQueue[dict[str, Any] | None]) -> None:
+    """Puts the events of a pipe, one line of JSON each, into a queue, and None at its end."""
     for line in stream:
         # a line without its end comes from a bridge that was killed while writing
         if line.endswith(b"\n"):
@@ -346,7 +347,7 @@ def main() -> int:
         session = _Session(configuration, attachments)
         _answer(ready=True)
         inbox: SimpleQueue[dict[str, Any] | None] = SimpleQueue()
-        threading.Thread(target=_listen, args=(stream, inbox), daemon=True).start()
+        threading.Thread(target=listen, args=(stream, inbox), daemon=True).start()
         session.run(inbox)
     except RecordingError as error:
         _answer(error=str(error))

@@ -36,7 +36,7 @@ from hapticbridge.errors import (
 from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, HAND_CODES, OK, RING_FULL
 from hapticbridge.kernel.mujoco_c import quiet, without_timers
 from hapticbridge.realtime import real_time
-from hapticbridge.recording.recorder import RingObserver
+from hapticbridge.recording.recorder import RecordOutput, RingObserver
 from hapticbridge.run.commands import Command, Repeat, Stop
 from hapticbridge.run.hands import (
     DeviceGroup,
@@ -52,7 +52,7 @@ from hapticbridge.run.options import (
     device_for_run,
 )
 from hapticbridge.run.request import RunRequest
-from hapticbridge.run.session import RecordOutput, Session, StopRequest
+from hapticbridge.run.session import Session, StopRequest
 from hapticbridge.run.summary import Ledger, Summary
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.compile import clause

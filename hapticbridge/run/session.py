@@ -1,7 +1,7 @@
 """Resources of an open run, and their orderly release.
 
 ``Session`` owns them. ``TickKernel`` is the arithmetic of a tick around MuJoCo's step,
-``RecordOutput`` the destinations of the records, ``StopRequest`` a wish to end the run.
+``StopRequest`` a wish to end the run.
 """
 
 from __future__ import annotations
@@ -10,9 +10,8 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -52,7 +51,7 @@ from hapticbridge.realtime import (
     warn_of_refusals,
     warn_of_slow_motion,
 )
-from hapticbridge.recording.recorder import RecordStream, RingObserver
+from hapticbridge.recording.recorder import RecordOutput, RecordStream
 from hapticbridge.recording.ring import Snapshot
 from hapticbridge.run.commands import CommandExecutor, CommandQueue, EventApplier
 from hapticbridge.run.description import (
@@ -106,45 +105,6 @@ class StopRequest:
         while self.waiting:
             last = self.waiting.popleft()
         return last
-
-
-@dataclass(frozen=True, slots=True)
-class RecordOutput:
-    """Destinations of a run's records.
-
-    Attributes:
-        path: File of the recording; None records nothing.
-        observer: Second reader of the records, such as ``view.Window``; None without one.
-        live: True shows the state of the run on standard error.
-    """
-
-    path: Path | None = None
-    observer: RingObserver | None = None
-    live: bool = False
-
-    def open_stream(
-        self, period: float, snapshot: Snapshot | None, *, may_wait: bool, hands: int = 1
-    ) -> RecordStream:
-        """Returns the ring of the records; the files are opened when the stream is started.
-
-        Args:
-            period: T in s.
-            snapshot: Shared memory with the scene's positions, for the observer.
-            may_wait: True if the loop may wait for the recorder.
-            hands: Number of hands.
-
-        Raises:
-            RecordingError: There is no memory for the ring.
-        """
-        return RecordStream(
-            self.path,
-            period,
-            live=self.live,
-            may_wait=may_wait,
-            observer=self.observer,
-            snapshot=str(snapshot and snapshot.name),
-            hands=hands,
-        )
 
 
 class MarkButton:
@@ -328,8 +288,12 @@ class Session:
             self._snapshot = None if self.output.observer is None else Snapshot.shared(scene.model)
             if self._snapshot is not None:
                 resources.callback(self._snapshot.close)
-            self.stream = self.output.open_stream(
-                setup.period, self._snapshot, may_wait=clock.may_wait, hands=len(self._setups)
+            self.stream = RecordStream(
+                self.output,
+                setup.period,
+                may_wait=clock.may_wait,
+                snapshot=str(self._snapshot and self._snapshot.name),
+                hands=len(self._setups),
             )
             resources.callback(self._close_stream)
         sample = np.zeros(len(self._setups), SAMPLE_DTYPE)

@@ -4,7 +4,8 @@ Read ``load`` first. It reads a scene, finds what the hand holds (``grip``), add
 coupling (``handle``), compiles it (``compile``) and refuses unsuitable scenes (``checks``). The
 result is a ``scene.Scene``, which a bridge steps. ``source`` keeps the files' bytes for the
 recording, ``parameters`` the scene's settable numbers, ``contacts`` a measured rule for contacts
-that create energy.
+that create energy. ``first_faults`` are those that a run tells at its start, each a ``fault`` with
+its place in the files (``source_map``).
 """
 
 from hapticbridge.scene.compile import custom_numbers as custom_numbers

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from typing import Literal, NamedTuple
 
 import mujoco
 import numpy as np
@@ -89,7 +90,24 @@ def seat_handle(model: mujoco.MjModel, grip: str) -> None:
             model.key_mquat[key].reshape(-1, 4)[mocap_id] = data.site_xquat[site_id]
 
 
-def hold_servos(model: mujoco.MjModel) -> tuple[str, ...]:
+class SceneChange(NamedTuple):
+    """Difference of a running scene from its file.
+
+    Attributes:
+        words: The change as ``name: old → new``.
+        kind: Changed setting, where a rule of ``hapticbridge check`` examines it; empty elsewhere.
+        reason: Cause in the run, of a change that the scene alone does not determine; else empty.
+    """
+
+    words: str
+    kind: Literal["", "integrator", "solver", "start"] = ""
+    reason: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.words} ({self.reason})" if self.reason else self.words
+
+
+def hold_servos(model: mujoco.MjModel) -> tuple[SceneChange, ...]:
     """Aims the position servos at their pose in keyframe ``home`` if this has no controls.
 
     MuJoCo reads missing controls as zeros, so that the servos would fling the scene out of the pose
@@ -114,7 +132,9 @@ def hold_servos(model: mujoco.MjModel) -> tuple[str, ...]:
                 model.key_ctrl[key, control] = target
                 moved.append(model.actuator(actuator).name or str(actuator))
     count = f"{len(moved)} servo{'s' if len(moved) > 1 else ''}"
-    return (f"ctrl of {count} in keyframe '{START_KEYFRAME}': 0 → its pose",) if moved else ()
+    if not moved:
+        return ()
+    return (SceneChange(f"ctrl of {count} in keyframe '{START_KEYFRAME}': 0 → its pose"),)
 
 
 def _is_servo(model: mujoco.MjModel, actuator: int) -> bool:

@@ -48,7 +48,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.errors import SceneError
+from hapticbridge.errors import SceneError, SceneWarning
+from hapticbridge.scene.compile import SceneChange
 
 STRICT_STEPS = 60.0
 """τ/h above which a contact of moderate stiffness created no energy in any run of the map (its
@@ -180,7 +181,7 @@ SOFT_FREQUENCY = 15.0
 holds at 24 Hz. A hand moves at up to 10 Hz, and would feel a softer one yield."""
 
 
-def announce_soft_equalities(model: mujoco.MjModel) -> tuple[str, ...]:
+def announce_soft_equalities(model: mujoco.MjModel) -> tuple[SceneChange, ...]:
     """Returns a sentence on equality constraints that rigid ones replace, as ``name: old → new``.
 
     An equality holds a mass with ω² = κ/h² (κ of the module's first equation), so softly below
@@ -199,10 +200,11 @@ def announce_soft_equalities(model: mujoco.MjModel) -> tuple[str, ...]:
     if not names:
         return ()
     more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-    return (
+    words = (
         f"equality '{names[0]}'{more}: a spring of {slowest:.2g} Hz → rigid (--contact scene keeps "
-        "it, and may then create energy)",
+        "it, and may then create energy)"
     )
+    return (SceneChange(words),)
 
 
 def impedance_at(solimp: Sequence[float], depth: float) -> float:
@@ -258,36 +260,42 @@ class Concern(NamedTuple):
         return f"{self.words}; write {self.change}"
 
 
+class ContactSetting(NamedTuple):
+    """MuJoCo's parameters of a contact.
+
+    ``condim`` is 1 without friction; ``friction`` is the coefficient of sliding.
+    """
+
+    solref: tuple[float, ...]
+    solimp: tuple[float, ...]
+    condim: int = 3
+    friction: float = 1.0
+
+
 def contact_concerns(
-    solref: Sequence[float],
-    solimp: Sequence[float],
+    setting: ContactSetting,
     timestep: float,
     *,
     cone: Literal["elliptic", "pyramidal"] = "elliptic",
     diagexact: bool = True,
     refsafe: bool = True,
-    condim: int = 3,
-    friction: float = 1.0,
     only_active: bool = False,
 ) -> list[Concern]:
     """Returns the risks of a contact setting; empty for a recommended setting.
 
     Args:
-        solref: As for ``contact_numbers``, which raises the errors.
-        solimp: As for ``contact_numbers``.
+        setting: The contact's; ``contact_numbers`` raises the errors.
         timestep: h in s.
         cone: Friction cone; it matters only for condim > 1 and a friction below 0.4.
         diagexact: True if MuJoCo's exact diagonal is enabled. Without it more runs of the map's
             shipped setting create energy.
         refsafe: As for ``contact_numbers``.
-        condim: Dimension of the contact; 1 is without friction.
-        friction: Coefficient of sliding.
         only_active: If true, only risks that are likely to exceed the slack are returned.
 
     Returns:
         Risks whose words follow "the contact of …".
     """
-    numbers = contact_numbers(solref, solimp, timestep, refsafe=refsafe)
+    numbers = contact_numbers(setting.solref, setting.solimp, timestep, refsafe=refsafe)
     # + 0.0 turns a negative zero into 0
     steps, instead = numbers.relaxation + 0.0, suggested_solref(timestep)
     concerns = []
@@ -308,11 +316,12 @@ def contact_concerns(
                 f'solref="{REFERENCE_STEPS * timestep:g} 1" solimp="0.9 0.95 0.001"',
             )
         )
-    if cone == "pyramidal" and condim > 1 and friction < LOW_FRICTION:
+    if cone == "pyramidal" and setting.condim > 1 and setting.friction < LOW_FRICTION:
         concerns.append(
             Concern(
-                f"has a pyramidal cone and a friction of {friction:g}, below {LOW_FRICTION:g}, and "
-                "may create several times the energy that the coupling's slack allows",
+                f"has a pyramidal cone and a friction of {setting.friction:g}, below "
+                f"{LOW_FRICTION:g}, and may create several times the energy that the "
+                "coupling's slack allows",
                 'cone="elliptic" in <option>, or condim="1" for no friction',
                 is_cone=True,
             )
@@ -352,15 +361,6 @@ def _excess(numbers: ContactNumbers) -> str:
 # Contacts of a scene, checked against the measured rule
 
 
-class ContactSetting(NamedTuple):
-    """MuJoCo's parameters of a contact; ``friction`` is the coefficient of sliding."""
-
-    solref: tuple[float, ...]
-    solimp: tuple[float, ...]
-    condim: int
-    friction: float
-
-
 class _GeomSetting(NamedTuple):
     """Contact parameters of one geom, before mixing; the fields are MuJoCo's."""
 
@@ -375,7 +375,7 @@ class _GeomSetting(NamedTuple):
 def warn_of_contacts(model: mujoco.MjModel, grip: str, scene: object) -> None:
     """Warns of contacts that are likely to create more energy than the slack allows."""
     for concern in check_contacts(model, grip):
-        warnings.warn(f"scene '{scene}': {concern}", UserWarning, stacklevel=3)
+        warnings.warn(SceneWarning(scene, str(concern)), stacklevel=3)
 
 
 def check_contacts(
@@ -412,14 +412,11 @@ def check_contacts(
         )
         for setting, names in names_by_setting.items()
         for concern in contact_concerns(
-            setting.solref,
-            setting.solimp,
+            setting,
             step,
             cone="elliptic" if option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else "pyramidal",
             diagexact=bool(option.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT),
             refsafe=not option.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE,
-            condim=setting.condim,
-            friction=setting.friction,
             only_active=not is_thorough,
         )
     ]

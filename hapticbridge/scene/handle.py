@@ -36,7 +36,7 @@ from hapticbridge.scene.checks import (
     is_nested,
     overlaps,
 )
-from hapticbridge.scene.compile import go_to_start
+from hapticbridge.scene.compile import SceneChange, go_to_start
 
 # Weld between grip and handle (MuJoCo's equality constraint)
 
@@ -266,7 +266,7 @@ _INTEGRATORS = "Euler", "RK4", "implicit", "implicitfast", "discrete"
 _SOLVERS = "PGS", "CG", "Newton"
 
 
-def set_options(spec: mujoco.MjSpec, *, as_is: bool = False) -> tuple[str, ...]:
+def set_options(spec: mujoco.MjSpec, *, as_is: bool = False) -> tuple[SceneChange, ...]:
     """Sets the options for an implicit coupling and a known energy of every step.
 
     Solver PGS and ``noslip_iterations`` leave the coupling out of the implicit step, and the
@@ -283,22 +283,23 @@ def set_options(spec: mujoco.MjSpec, *, as_is: bool = False) -> tuple[str, ...]:
         SceneError: A change is needed that ``as_is`` forbids.
     """
     option, enable = spec.option, mujoco.mjtEnableBit
-    needed, changes = [], []
+    needed, changes = list[SceneChange](), list[SceneChange]()
     if (solver := int(option.solver)) != mujoco.mjtSolver.mjSOL_NEWTON:
-        changes.append(f"solver: {_SOLVERS[solver]} → Newton")
+        changes.append(SceneChange(f"solver: {_SOLVERS[solver]} → Newton", "solver"))
         needed += changes if solver == mujoco.mjtSolver.mjSOL_PGS else []
     if option.noslip_iterations > 0:
-        needed.append(f"noslip_iterations: {option.noslip_iterations} → 0")
+        needed.append(SceneChange(f"noslip_iterations: {option.noslip_iterations} → 0"))
     if option.enableflags & enable.mjENBL_SLEEP:
-        needed.append("flag sleep: enable → disable")
-    needed += _constrain_edges(spec, as_is=as_is)
+        needed.append(SceneChange("flag sleep: enable → disable"))
+    needed += map(SceneChange, _constrain_edges(spec, as_is=as_is))
     if needed and as_is:
         raise SceneError(
-            f"the scene needs other options to be coupled ({', '.join(needed)}); set them, or let "
-            "them be changed (without --as-is)"
+            f"the scene needs other options to be coupled ({', '.join(map(str, needed))}); "
+            "set them, or let them be changed (without --as-is)"
         )
     if (integrator := int(option.integrator)) != mujoco.mjtIntegrator.mjINT_DISCRETE:
-        changes.append(f"integrator: {_INTEGRATORS[integrator]} → the method's")
+        words = f"integrator: {_INTEGRATORS[integrator]} → the method's"
+        changes.append(SceneChange(words, "integrator"))
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.noslip_iterations = 0
@@ -335,7 +336,7 @@ def _constrain_edges(spec: mujoco.MjSpec, *, as_is: bool) -> list[str]:
 
 def limit_motors_alone(
     model: mujoco.MjModel, data: mujoco.MjData, grip: str, *, as_is: bool = False
-) -> tuple[str, ...]:
+) -> tuple[SceneChange, ...]:
     """Moves force limits from the joints that carry the grip to the actuators of these joints.
 
     MuJoCo's ``actuatorfrcrange`` limits the sum of all actuator forces on a joint, and the coupling
@@ -388,10 +389,13 @@ def limit_motors_alone(
             model.actuator_forcelimited[actuator] = 1
             model.actuator_forcerange[actuator] = low, high
     each = "each of its actuators" if shared else "its actuator"
-    return (f"force limit of joint '{name}'{more}: on all actuators together → on {each}",)
+    words = f"force limit of joint '{name}'{more}: on all actuators together → on {each}"
+    return (SceneChange(words),)
 
 
-def exclude_nested(spec: mujoco.MjSpec, model: mujoco.MjModel, grip: str) -> tuple[str, ...]:
+def exclude_nested(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, grip: str
+) -> tuple[SceneChange, ...]:
     """Excludes contacts between parts of a robot that begin inside each other, for good.
 
     A link whose hull encloses part of the link that carries it is inside it in every pose. A
@@ -419,16 +423,18 @@ def exclude_nested(spec: mujoco.MjSpec, model: mujoco.MjModel, grip: str) -> tup
         for body_id in (first, second):
             bodies[body_id].name = bodies[body_id].name or f"{PREFIX}body_{body_id}"
         spec.add_exclude(bodyname1=bodies[first].name, bodyname2=bodies[second].name)
-    return (f"contact where {_listed(list(pairs.values()))} at the start: on → off",)
+    where = _listed(list(pairs.values()))
+    return (SceneChange(f"contact where {where} at the start: on → off"),)
 
 
-def announce_overlaps(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[str, ...]:
-    """Returns a sentence on what overlaps at the start, as a change ``name: old → new``."""
+def announce_overlaps(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[SceneChange, ...]:
+    """Returns the change in the treatment of what overlaps at the start."""
     if found := overlaps(model, data, NOTABLE_OVERLAP):
-        return (
+        words = (
             f"start where {_listed(found)}: pushed out at once → held, and eased out with energy "
-            "that the scene has dissipated",
+            "that the scene has dissipated"
         )
+        return (SceneChange(words, "start"),)
     return ()
 
 

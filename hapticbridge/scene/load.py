@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import mujoco
 
 from hapticbridge.arguments import shown
-from hapticbridge.errors import SceneError, choices, nearest
+from hapticbridge.errors import SceneError, SceneWarning, choices, nearest
 from hapticbridge.scene.checks import (
     check_model,
     check_numbers,
@@ -21,7 +21,7 @@ from hapticbridge.scene.checks import (
     check_start,
     refuse_overlap,
 )
-from hapticbridge.scene.compile import clause, compiled, hold_servos, seat_handle
+from hapticbridge.scene.compile import SceneChange, clause, compiled, hold_servos, seat_handle
 from hapticbridge.scene.grip import add_grip
 from hapticbridge.scene.handle import (
     announce_overlaps,
@@ -144,8 +144,8 @@ def load_scene(
             ``grips``, else the site ``grip``.
         as_is: If true, a scene is refused that must be changed to be felt (options that exclude the
             coupling, force limits of joints, a tool inside something); else it is changed, and
-            ``Scene.changes`` lists the changes. A small memory (``LEAST_MEMORY``) is enlarged either
-            way, because that alters no motion.
+            ``Scene.changes`` lists the changes. A small memory (``LEAST_MEMORY``) is enlarged
+            either way, because that alters no motion.
         **parameters: Values of the scene's parameters, such as ``clearance=0.1e-3``.
             ``scene.scene_parameters`` and ``hapticbridge scenes NAME`` list them. A specification
             has none.
@@ -282,7 +282,7 @@ def compile_scene(
             before, spec.memory, spec.nstack, spec.njmax = model.narena, -1, -1, -1
             model = compiled(spec, source.sources)
             sizes = (format_si(size, "B") for size in (before, model.narena))
-            changes += (f"memory: {' → '.join(sizes)}",)
+            changes += (SceneChange(f"memory: {' → '.join(sizes)}"),)
         if not as_is and (excluded := exclude_nested(spec, model, grips[0])):
             changes, model = changes + excluded, compiled(spec, source.sources)
         concerns = [*source.concerns, *about_grip]
@@ -298,16 +298,16 @@ def compile_scene(
         scene.other_grips = grips[1:]
         scene.reset()
         for each in dict.fromkeys(grips):
-            scene.changes += limit_motors_alone(model, scene.data, each, as_is=as_is)
+            scene.differences += limit_motors_alone(model, scene.data, each, as_is=as_is)
     if checks_start:
         check_start(scene.data, grips[0])
     if as_is:
         refuse_overlap(model, scene.data, grips[0])
     else:
-        scene.changes += announce_overlaps(model, scene.data)
+        scene.differences += announce_overlaps(model, scene.data)
     if warns:
         for concern in concerns:
-            warnings.warn(f"scene '{path}': {concern}", UserWarning, stacklevel=stacklevel)
+            warnings.warn(SceneWarning(path, concern), stacklevel=stacklevel)
     return scene
 
 

@@ -24,7 +24,7 @@ from hapticbridge.kernel.colliders import use_exact_points
 from hapticbridge.kernel.mujoco_c import warning_of
 from hapticbridge.kernel.pose import IDENTITY_POSE
 from hapticbridge.kernel.rigid_contact import IMPRATIO, LARGEST_MARGIN, MARGIN, largest_margin
-from hapticbridge.scene.compile import clause, compiled, go_to_start
+from hapticbridge.scene.compile import SceneChange, clause, compiled, go_to_start
 from hapticbridge.scene.contacts import announce_soft_equalities
 from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
 from hapticbridge.scene.source import SourceFile
@@ -82,7 +82,7 @@ class Scene:
         data: State of the model.
         sources: The original bytes of the file, its includes and its assets.
         parameters: Value of each of the scene's parameters, in the unit of its parameter file.
-        changes: What differs from the file, each as ``name: old → new``.
+        differences: What differs from the file.
         as_is: True if the scene must not be changed to be felt.
         is_carried: True if the weight of the tool is compensated (``carry_tool``).
         other_grips: Names of the sites that further hands hold.
@@ -97,7 +97,7 @@ class Scene:
     data: mujoco.MjData
     sources: tuple[SourceFile, ...]
     parameters: dict[str, float] = field(default_factory=dict)
-    changes: tuple[str, ...] = ()
+    differences: tuple[SceneChange, ...] = ()
     as_is: bool = False
     is_carried: bool = False
     other_grips: tuple[str, ...] = ()
@@ -109,6 +109,11 @@ class Scene:
     _reach: float = 0.0
     _period: float = 0.0
     _own_contact: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def changes(self) -> tuple[str, ...]:
+        """Differences from the file, each as ``name: old → new``, some with a reason."""
+        return tuple(map(str, self.differences))
 
     def claim(self) -> None:
         """Reserves the scene for one bridge, because two bridges would move one tool.
@@ -213,12 +218,12 @@ class Scene:
             self._set_margins()
             return
         said = announce_soft_equalities(model)
-        self.changes = tuple(change for change in self.changes if change not in said)
+        self.differences = tuple(each for each in self.differences if each not in said)
         if not is_rigid:
             self._restore_contact(model)
             self._own_contact = {}
             return
-        self.changes = said + self.changes
+        self.differences = said + self.differences
         needed = _rigid_options(model.opt)
         own = {name: getattr(model.opt, name) for name in needed}
         own |= {name: getattr(model, name).copy() for name in (*_MARGINS, *_LIMIT_MARGINS)}
@@ -284,7 +289,7 @@ class Scene:
             body_id = held_body(model, grip)
             model.body_gravcomp[model.body_treeid == model.body_treeid[body_id]] = 1.0
         self.is_carried = True
-        self.changes += (f"weight of the tool: felt → carried ({reason})",)
+        self.differences += (SceneChange("weight of the tool: felt → carried", reason=reason),)
         self.reset()
 
     def _recompile(self, spec: mujoco.MjSpec) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,28 +36,33 @@ HUGE = 1e100
 """Force in N at which a run counts as diverged and ends."""
 
 
+class _Recursion(NamedTuple):
+    """Constants of the recursion of ``SampledLoop``.
+
+    Those named c and a belong to the damper, p, q and r to the hand; ``integrator`` is given as
+    samples of delay.
+    """
+
+    stiffness: float
+    c: float
+    a: float
+    inverse_mass: float
+    integrator: int
+    delay: int
+    period: float
+    p: float
+    q: float
+    r: float
+
+
 @compiled
-def run(
-    stiffness: float,
-    c: float,
-    a: float,
-    inverse_mass: float,
-    integrator: int,
-    delay: int,
-    period: float,
-    p: float,
-    q: float,
-    r: float,
-    force: _Array,
-    handle: _Array,
-    tool: _Array,
-) -> int:
+def run(recursion: _Recursion, force: _Array, handle: _Array, tool: _Array) -> int:
     """Fills the arrays with f_k, h_k and x_k and returns the number of samples taken.
 
-    The recursion is that of ``SampledLoop``. Its arguments c and a belong to the damper, p, q and r
-    to the hand; ``integrator`` is given as samples of delay. A run that diverges in its last sample
+    A run that diverges in its last sample
     returns one sample fewer, so that a length below the capacity always means divergence.
     """
+    stiffness, c, a, inverse_mass, integrator, delay, period, p, q, r = recursion
     h, x, v, stretch, damper, f = KICK, 0.0, 0.0, 0.0, 0.0, 0.0
     held_before, device_velocity = 0.0, 0.0
     step_compliance = period * period * inverse_mass if integrator == 0 else 0.0
@@ -334,7 +340,7 @@ class SampledLoop:
             )
         force, handle, tool = np.zeros((3, whole("run", samples, least=1)))
         step = self.period if self.discretization == "backward" else self.period / 2
-        done = run(
+        recursion = _Recursion(
             self.coupling.stiffness,
             self.coupling.damping / (step + self.filter_time),
             (self.filter_time - (self.period - step)) / (step + self.filter_time),
@@ -343,10 +349,8 @@ class SampledLoop:
             self.delay,
             self.period,
             *((0.0, 0.0, 0.0) if hand is None else hand.recursion()),
-            force,
-            handle,
-            tool,
         )
+        done = run(recursion, force, handle, tool)
         return LoopMotion(force[:done], handle[:done], tool[:done])
 
 

@@ -28,6 +28,7 @@ from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.record import force_on_hand
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.format import further_hands
+from hapticbridge.recording.recorder_process import listen
 from hapticbridge.recording.ring import Snapshot
 from hapticbridge.replay.stage import MIN_REFERENCE, is_held, tell_apart
 from hapticbridge.run.description import parameters_of
@@ -143,13 +144,6 @@ def run_of(metadata: dict[str, str], files: dict[str, bytes]) -> RecordingFile:
     )
 
 
-def _listen(stream: IO[bytes], inbox: queue.SimpleQueue[dict[str, Any] | None]) -> None:
-    for line in stream:
-        if line.endswith(b"\n"):
-            inbox.put(json.loads(line))
-    inbox.put(None)
-
-
 def _read_job(stream: IO[bytes]) -> tuple[dict[str, Any], RecordingFile]:
     job = json.loads(stream.readline())
     files = {name: stream.read(size) for name, size in job["attachments"]}
@@ -226,7 +220,7 @@ def run() -> None:
         return
     print(json.dumps({"url": address.url(server.get_port())}), file=answers, flush=True)
     inbox: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
-    threading.Thread(target=_listen, args=(stream, inbox), daemon=True).start()
+    threading.Thread(target=listen, args=(stream, inbox), daemon=True).start()
     threading.Thread(target=outlet.run, daemon=True).start()
     reason = _follow(live, page, controls, inbox) or "the bridge is gone"
     page.status.content = f"**The run is over** ({quoted(reason)}). This is how it was at the end."

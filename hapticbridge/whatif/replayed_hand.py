@@ -344,8 +344,8 @@ class Repetition:
             stack.enter_context(suppress(SafetyTrip))  # the recording has it
             self._repeat(bridge)
         # the temporary path of the unpacked scene means nothing to the reader
-        messages = [str(each.message).replace(str(run.scene_file), "") for each in caught]
-        self.warned = tuple(dict.fromkeys(text.removeprefix("scene '': ") for text in messages))
+        messages = (getattr(each.message, "concern", str(each.message)) for each in caught)
+        self.warned = tuple(dict.fromkeys(messages))
         return bridge.period
 
     def scene(self) -> Scene:

@@ -39,7 +39,8 @@ def compile_ahead() -> None:
         # quiet where it may not write: nobody else may then
         compileall.compile_dir(CHECKOUT / folder, quiet=2)
     time = VirtualTime(falcon())
-    device = FalconDevice(VirtualLink(time), mass=MASS, damping=DAMPING, friction=FRICTION)
+    numbers = {"mass": MASS, "damping": DAMPING, "friction": FRICTION}
+    device = FalconDevice(VirtualLink(time), numbers=numbers)
     with Bridge("peg_in_hole", device, clock=VirtualClock(time)) as bridge:
         bridge.run(_LONG_ENOUGH)
     hands = [Grasp(grip) for grip in own_grips(read_scene("nut_and_wrench"))]

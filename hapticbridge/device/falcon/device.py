@@ -152,7 +152,7 @@ class FalconDevice:
         link: Link to the Falcon.
         name: Name of the device in messages.
         firmware: Firmware file for a device without firmware; None if it has its firmware.
-        mass, damping, friction: Values at the grip in kg, N s/m and N, or None.
+        numbers: Mass, damping and friction at the grip in kg, N s/m and N, by name, where known.
         notify: Receives messages for the user.
 
     Raises:
@@ -166,9 +166,7 @@ class FalconDevice:
         *,
         name: str = "falcon",
         firmware: str | None = None,
-        mass: float | None = None,
-        damping: float | None = None,
-        friction: float | None = None,
+        numbers: Mapping[str, float] | None = None,
         notify: Notify = ignore_message,
     ) -> None:
         self._link, self._name = link, name
@@ -178,17 +176,16 @@ class FalconDevice:
             bring_up(link, self._stream, name, firmware, notify)
             home(link, self._stream, name, notify)
             rate, delay = measured_timing(link, self._stream, name)
+            known: dict[str, Any] = dict(numbers or {})
             self.info = DeviceInfo(
                 name="falcon",
                 axes=("x", "y", "z"),
-                mass=mass,
-                damping=damping,
-                friction=friction,
                 resolution=resolution(),
                 force_limit=FORCE_LIMIT,
                 speed_limit=SPEED_LIMIT,
                 rate=rate,
                 delay=delay,
+                **known,
             )
         self._motion = np.zeros(1, MOTION_DTYPE)
         self._last = np.zeros(1, SAMPLE_DTYPE)
@@ -295,7 +292,9 @@ def open_falcon(options: Mapping[str, object], notify: Notify, backend: Any = No
     link = UsbLink.open(
         plugged, DRIVER, read_from=READ_FROM, write_to=WRITE_TO, backend=backend, log=log
     )
-    device = FalconDevice(link, name=str(plugged), firmware=firmware, notify=notify, **numbers)
+    device = FalconDevice(
+        link, name=str(plugged), firmware=firmware, numbers=numbers, notify=notify
+    )
     device.info = replace(device.info, serial=plugged.serial)
     return device
 

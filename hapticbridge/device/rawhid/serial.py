@@ -29,6 +29,7 @@ from hapticbridge.device.driver import (
     FoundDevice,
     Notify,
     access_problem,
+    is_refused,
 )
 from hapticbridge.device.rawhid.device import (
     CHANGES,
@@ -108,6 +109,7 @@ class SystemPorts:
                 product=port.pid or 0,
                 transport="serial",
                 problem=access_problem(port.device) if port.device.startswith("/") else None,
+                lacks_permission=port.device.startswith("/") and is_refused(port.device),
             )
             for port in listing.comports()
             if port.vid is not None

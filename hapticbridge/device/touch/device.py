@@ -388,7 +388,10 @@ def find() -> list[FoundDevice]:
         problem = None
     except DeviceError as error:
         problem = str(error)
-    return [replace(device, problem=problem) for device in usb_search.find(DRIVER)]
+    return [
+        replace(device, problem=problem, lacks_permission=False)
+        for device in usb_search.find(DRIVER)
+    ]
 
 
 def medium() -> str:

@@ -14,7 +14,13 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from hapticbridge.device.base import calling_on_error
-from hapticbridge.device.driver import Driver, FoundDevice, access_problem, select_device
+from hapticbridge.device.driver import (
+    Driver,
+    FoundDevice,
+    access_problem,
+    is_refused,
+    select_device,
+)
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.transport.usb import members, on_the_bus
 from hapticbridge.errors import DeviceError, DeviceLost
@@ -95,12 +101,13 @@ def find(driver: Driver, api: HidApi | None = None) -> list[FoundDevice]:
             product=product,
             transport="hid",
             problem=access_problem(path) if is_node else None,
+            lacks_permission=is_node and is_refused(path),
         )
     if api is not None:
         return list(found.values())
     unlisted = (d for d in on_the_bus() if module is None or not d.has_hidraw)
     problem = NO_NODE if module is not None else NO_HIDAPI
-    return [*found.values(), *members(driver, unlisted, lambda _: problem)]
+    return [*found.values(), *members(driver, unlisted, problem)]
 
 
 def report_descriptor(path: str, api: HidApi | None) -> bytes:

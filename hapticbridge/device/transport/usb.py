@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,13 @@ import usb.backend.libusb1 as pyusb
 import usb.core
 import usb.util
 
-from hapticbridge.device.driver import Driver, FoundDevice, access_problem, permission_problem
+from hapticbridge.device.driver import (
+    Driver,
+    FoundDevice,
+    access_problem,
+    is_refused,
+    permission_problem,
+)
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.errors import DeviceError, DeviceLost
 
@@ -58,15 +64,14 @@ class OnTheBus:
     has_hidraw: bool
 
 
-def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
+def on_the_bus() -> list[OnTheBus]:
     """Lists the devices on the USB bus, in the order of their bus positions; empty without a bus.
 
     This requires neither libusb nor a permission. A device unplugged meanwhile is left out.
     """
-    folder = BUS if bus is None else bus
     found = []
     try:
-        entries = sorted(folder.iterdir())
+        entries = sorted(BUS.iterdir())
     except OSError:
         return []
     for entry in entries:
@@ -92,10 +97,8 @@ def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
     return found
 
 
-def members(
-    driver: Driver, devices: Iterable[OnTheBus], problem: Callable[[OnTheBus], str | None]
-) -> list[FoundDevice]:
-    """Returns the devices of a driver; ``problem`` returns why one cannot be opened, or None."""
+def members(driver: Driver, devices: Iterable[OnTheBus], problem: str | None) -> list[FoundDevice]:
+    """Returns the devices of a driver; ``problem`` says why none can be opened, if none can."""
     return [
         FoundDevice(
             driver=driver.name,
@@ -105,7 +108,8 @@ def members(
             vendor=device.vendor,
             product=device.product,
             transport=driver.transport,
-            problem=problem(device),
+            problem=problem or access_problem(str(device.node)),
+            lacks_permission=problem is None and is_refused(str(device.node)),
         )
         for device in devices
         if (model := driver.model(device.vendor, device.product)) is not None
@@ -231,15 +235,12 @@ def find(driver: Driver, backend: Any = None) -> list[FoundDevice]:
     On Linux the kernel's list is used, because opening a device would disturb a running loop. On
     other systems libusb is used. Devices are in the order of their bus positions.
     """
-    listed = [] if backend is not None else members(driver, on_the_bus(), _problem)
+    problem = None
+    if backend is None and libusb() is None:
+        problem = "libusb cannot be loaded; reinstall the package 'libusb-package'"
+    listed = [] if backend is not None else members(driver, on_the_bus(), problem)
     source = libusb() if backend is None and not listed else backend
     return listed if source is None else [_described(driver, d) for d in devices_of(driver, source)]
-
-
-def _problem(device: OnTheBus) -> str | None:
-    if libusb() is None:
-        return "libusb cannot be loaded; reinstall the package 'libusb-package'"
-    return access_problem(str(device.node))
 
 
 def devices_of(driver: Driver, backend: Any) -> list[Any]:
@@ -258,7 +259,7 @@ def node_of(device: Any) -> str:
 
 
 def _described(driver: Driver, device: Any) -> FoundDevice:
-    node, problem, texts = node_of(device), None, ["", ""]
+    node, is_denied, texts = node_of(device), False, ["", ""]
     try:
         device.get_active_configuration()  # opens the device; get_string would hide the error
         texts = [
@@ -266,7 +267,7 @@ def _described(driver: Driver, device: Any) -> FoundDevice:
             for index in (device.iProduct, device.iSerialNumber)
         ]
     except usb.core.USBError as error:
-        problem = permission_problem(node) if error.errno == errno.EACCES else None
+        is_denied = error.errno == errno.EACCES
     except (ValueError, NOT_SUPPORTED):
         pass  # the device has no texts, or libusb cannot open it here
     finally:
@@ -279,7 +280,7 @@ def _described(driver: Driver, device: Any) -> FoundDevice:
         vendor=device.idVendor,
         product=device.idProduct,
         transport="usb",
-        problem=problem,
+        lacks_permission=is_denied,
     )
 
 

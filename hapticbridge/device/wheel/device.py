@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +96,24 @@ MEASURED = ("rotational_inertia", "rotational_damping")
 """Numbers of the data sheet that are known only from a measurement."""
 
 
+class Rim(NamedTuple):
+    """Turning part of a wheel.
+
+    Attributes:
+        max_torque: Torque at full level in N m, > 0.
+        turn: Rotation from stop to stop in rad, > 0.
+        axis: Axis of the rotation, ``rx``, ``ry`` or ``rz``.
+        rate: Rate of the device in Hz, > 0.
+        is_reversed: True to change the sign of the torque.
+    """
+
+    max_torque: float
+    turn: float
+    axis: str
+    rate: float
+    is_reversed: bool
+
+
 class WheelDevice:
     """An open wheel.
 
@@ -104,11 +122,7 @@ class WheelDevice:
 
     Args:
         node: The open input device.
-        max_torque: Torque at full level in N m, > 0.
-        turn: Rotation from stop to stop in rad, > 0.
-        axis: Axis of the rotation, ``rx``, ``ry`` or ``rz``.
-        rate: Rate of the device in Hz, > 0.
-        is_reversed: True to change the sign of the torque.
+        rim: Its turning part.
         known: Numbers of the data sheet, by name.
 
     Attributes:
@@ -122,12 +136,7 @@ class WheelDevice:
     def __init__(
         self,
         node: InputNode,
-        *,
-        max_torque: float,
-        turn: float,
-        axis: str = "rz",
-        rate: float = USUAL_RATE,
-        is_reversed: bool = False,
+        rim: Rim,
         known: Mapping[str, float] | None = None,
     ) -> None:
         self._node, self._name = node, node.name
@@ -135,18 +144,18 @@ class WheelDevice:
         if reason := lack_of(node):
             raise DeviceError(f"{self._name} cannot be driven: {reason}")
         self._range = node.axis(ABS_X)
-        self._turn = turn
-        self._place = AXES.index(axis)
-        self._scale = (-FULL if is_reversed else FULL) / max_torque
+        self._turn = rim.turn
+        self._place = AXES.index(rim.axis)
+        self._scale = (-FULL if rim.is_reversed else FULL) / rim.max_torque
         keys = [code for code in node.codes(EV_KEY) if FIRST_BUTTON <= code <= LAST_BUTTON]
         stated: dict[str, Any] = dict(known or {})
         self._bits = {code: 1 << bit for bit, code in enumerate(sorted(keys)[:MAX_BUTTONS])}
         self.info = DeviceInfo(
             name=self._name,
-            axes=(axis,),
+            axes=(rim.axis,),
             force_limit=USUAL_FORCE_LIMIT,
-            torque_limit=max_torque,
-            rate=rate,
+            torque_limit=rim.max_torque,
+            rate=rim.rate,
             serial=node.serial,
             buttons=len(self._bits),
             **stated,
@@ -315,15 +324,8 @@ def open_wheel(
     rate = checked_number("rate", options.get("rate", rate), "Hz", is_positive=True)
     node = open_node(system, plugged.path, HexLog.from_options(options))
     with calling_on_error(node.close):
-        device = WheelDevice(
-            node,
-            max_torque=max_torque,
-            turn=math.radians(turn),
-            axis=str(axis),
-            rate=rate,
-            is_reversed=is_reversed,
-            known=numbers,
-        )
+        rim = Rim(max_torque, math.radians(turn), str(axis), rate, is_reversed)
+        device = WheelDevice(node, rim, numbers)
     notify(
         f"{plugged}: {max_torque:g} N m at full level, {turn:g} degrees from stop to stop, changed "
         f"up to {rate:g} times a second; autocentre off"

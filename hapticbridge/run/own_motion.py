@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.observe import Setting, rehearsal_parameters
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import RIGID
+from hapticbridge.demand.rehearsal import Setting, rehearsal_parameters
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.mujoco_c import quiet

@@ -1,0 +1,95 @@
+"""Faults of a scene, each with its place and remedy, and the numbers in their sentences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.scene.load import SceneSource
+from hapticbridge.scene.scene import Scene
+from hapticbridge.scene.source_map import Place, Places
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One fault of a scene.
+
+    Attributes:
+        kind: Name of the kind of fault.
+        place: File, line and element.
+        sentence: Description with its numbers.
+        change: Text to write at the place.
+        is_note: True if a run works as well without the change; the scene counts as sound.
+    """
+
+    kind: str
+    place: Place
+    sentence: str
+    change: str
+    is_note: bool = False
+
+
+def number(value: float) -> str:
+    """Formats a number with three digits and no exponent: ``2500``, ``0.0375``."""
+    if not math.isfinite(value):
+        return "infinite"
+    return np.format_float_positional(float(f"{value:.3g}"), trim="-")
+
+
+def length(value: float) -> str:
+    """Formats a length given in m: ``375 µm``, ``4.2 mm``, ``3.1 m``."""
+    for unit, size in (("m", 1.0), ("mm", 1e-3)):
+        if abs(value) >= size:
+            return f"{number(value / size)} {unit}"
+    return f"{number(1e6 * value)} µm"
+
+
+def weight(mass: float) -> str:
+    """Formats a mass given in kg: ``1.2 kg``, ``35 g``."""
+    return f"{number(mass)} kg" if mass >= 0.1 else f"{number(1e3 * mass)} g"
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Formats the values of an attribute: ``0.9 0.95 0.001``."""
+    return " ".join(f"{value:g}" for value in values)
+
+
+def others(count: int) -> str:
+    """Returns " and N more", or nothing for N = 0."""
+    return f" and {count} more" if count > 0 else ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CompiledScene:
+    """A scene with its files, which is all that a rule without a motion needs.
+
+    Attributes:
+        source: The scene as its files describe it.
+        scene: The scene as it runs, with handle and coupling.
+        places: Lines of the files on which elements are written.
+    """
+
+    source: SceneSource
+    scene: Scene
+    places: Places
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """Compiled scene with handle, at its running time step."""
+        return self.scene.model
+
+    @property
+    def step(self) -> float:
+        """Time step h in s."""
+        return float(self.model.opt.timestep)
+
+    @property
+    def tool_bodies(self) -> NDArray[np.bool_]:
+        """True for each body of the grip's tree, (nbody,)."""
+        tree = self.model.body_treeid[self.model.site(self.scene.grip).bodyid[0]]
+        return np.asarray(self.model.body_treeid == tree, dtype=bool)
