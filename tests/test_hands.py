@@ -576,21 +576,9 @@ def test_one_hand_that_is_named_is_as_today(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ("--hand", "left=simulated", "--hand", "left=simulated"),
-            "there must be 2 to 8 different grips",
-        ),
         (("--hand", "left"), "--hand is 'left'; it must be GRIP=DEVICE"),
         (("--hand", "a=simulated", "--device", "mouse"), "takes the place of --grip and --device"),
-        (
-            ("--hand", "left=simulated", "--hand", "right=simulated", "--port", "0"),
-            "--port without --view has no effect",
-        ),
         (("--hand", "a=simulated", "--hand", "b=mouse"), "the device 'mouse' moves in real time"),
-        (
-            ("--hand", "left=simulated", "--hand", "right=simulated", "--method", "lossless"),
-            "method 'lossless' has one hand",
-        ),
         (
             ("--hand", "left=simulated", "--hand", "right=simulated", "--dead-man", "0"),
             "--clutch and --dead-man are buttons of a real device, and no hand has one",
@@ -608,7 +596,6 @@ def test_one_hand_that_is_named_is_as_today(
             ("--hand", "left=simulated", "--hand", "right=simulated", "--absolute"),
             "hand at 'left': the device's absolute pose puts the handle 100 mm from the grip",
         ),
-        (("--hand", "left=falcon", "--hand", "right=simulated"), "leave out --fast"),
     ],
 )
 def test_the_command_refuses_in_one_sentence(
