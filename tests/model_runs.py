@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from hapticbridge.kernel.codes import HANDLE
 from hapticbridge.scene import scene_names
+from hapticbridge.scene.parameters import apply_parameters
 
 Array: TypeAlias = NDArray[np.float64]
 Edit: TypeAlias = Callable[[Any], None]
@@ -45,11 +46,16 @@ def spec_of(name: str) -> Any:
     return mujoco.MjSpec.from_file(str(MODELS / name / f"{name}.xml"))
 
 
-def scene_with_handle(name: str, edit: Edit | None = None) -> tuple[Any, Any]:
-    """Compiles a scene with a handle at its grip and the coupling as site actuators."""
+def scene_with_handle(name: str, edit: Edit | None = None, **values: float) -> tuple[Any, Any]:
+    """Compiles a scene with a handle at its grip and the coupling as site actuators.
+
+    The package writes the values of the scene's parameters.
+    """
     spec = spec_of(name)
     if edit is not None:
         edit(spec)
+    if values:
+        apply_parameters(spec, MODELS / name / f"{name}.xml", values)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)

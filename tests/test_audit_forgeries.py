@@ -94,15 +94,8 @@ def tripped(folder: Path) -> Path:
 
 
 def swung(folder: Path) -> Path:
-    """A coupling too stiff for its device swings up: the run is active."""
-    scene = report_runs.ANVIL.replace(
-        "<worldbody>",
-        '<custom><numeric name="simulated_hand" data="60 0"/></custom><worldbody>',
-    )
-    device = SimulatedDevice(mass=0.2, damping=0.1, hand=report_runs.LIGHT_HAND)
-    coupling = Coupling(10_000.0, 0.05, 0.1, 1e-4)
-    path = folder / "swung.mcap"
-    return report_runs.made_in(path, scene, device, coupling, duration=1.0, controller="off")
+    """The run is active."""
+    return report_runs.swung(folder / "swung.mcap", duration=1.0)
 
 
 def weighed(folder: Path) -> Path:

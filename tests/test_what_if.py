@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -290,20 +289,6 @@ def test_motions_are_told_apart_by_rate(wall: Path) -> None:
     np.testing.assert_allclose(after[1:-1:2], middle, rtol=0, atol=1e-12)
 
 
-LIGHTLY_HELD = report_runs.ANVIL.replace(
-    "<worldbody>", '<custom><numeric name="simulated_hand" data="60 0"/></custom><worldbody>'
-)
-"""A tool that stays where it is, and a hand that burns nothing: a stiff spring swings up."""
-
-TOO_STIFF = Coupling(10_000.0, 0.05, 0.1, 1e-4)
-
-
-def swung(path: Path, controller: str | None, duration: float = 0.1) -> Path:
-    device = SimulatedDevice(mass=0.2, damping=0.1, hand=report_runs.LIGHT_HAND)
-    options: dict[str, Any] = {"duration": duration, "controller": controller}
-    return report_runs.made_in(path, LIGHTLY_HELD, device, TOO_STIFF, **options)
-
-
 @pytest.mark.parametrize("button", ["clutch", "dead_man"])
 def test_a_button_does_again_what_it_did(button: str, tmp_path: Path) -> None:
     path = tmp_path / "pressed.mcap"
@@ -336,19 +321,10 @@ def drift(step: float) -> Callable[[int], tuple[float, ...]]:
     return lambda tick: (step * tick, 0, 0, 1, 0, 0, 0)
 
 
-EVERY_LIMIT = Limits(
-    force=3.0,
-    torque=0.2,
-    ramp=0.02,
-    stretch=0.1,
-    angle=1.0,
-    energy=math.inf,
-    reach=0.5,
-)
 REPEATED: dict[str, tuple[ScriptedDevice, dict[str, Any], TickFlag]] = {
     "limits": (
         ScriptedDevice(lambda tick: (0.004 * (tick > 60), 0, 0, 1, 0, 0, 0)),
-        {"limits": EVERY_LIMIT, "workspace": Workspace(scale=2.0)},
+        {"limits": Limits(force=3.0, torque=0.2, ramp=0.02), "workspace": Workspace(scale=2.0)},
         TickFlag.FORCE_LIMITED,
     ),
     "the edge of the reach": (
@@ -374,10 +350,7 @@ def test_what_the_guard_did_comes_back_in_every_bit(name: str, tmp_path: Path) -
     before, after = (run.ticks for run in found.runs[:2])
     assert (before["flags"] & int(flag)).any()
     assert before.tobytes() == after.tobytes()
-    if name == "limits":
-        [run] = RecordedRun.from_hands([read_recording(path)], tmp_path / "scene")
-        assert run.request.options.limits == EVERY_LIMIT
-    elif name == "old samples":
+    if name == "old samples":
         slower = what_if(path, {"rate": 700}).runs[1]
         for ticks in (before, slower.ticks):  # it has faded
             assert np.abs(ticks["wrench_on_device"][-1]).max() == 0.0
@@ -388,7 +361,7 @@ def test_what_the_guard_did_comes_back_in_every_bit(name: str, tmp_path: Path) -
 
 
 def test_a_model_hand_feels_the_controller_that_is_asked_for(tmp_path: Path) -> None:
-    path = swung(tmp_path / "run.mcap", "off", duration=1.4)
+    path = report_runs.swung(tmp_path / "run.mcap", duration=1.4)
     ticks = {}
     for name in ("off", "damper"):
         found = what_if(path, {"controller": name})
