@@ -23,7 +23,7 @@ from hapticbridge.scene import scene_names
 from hapticbridge.scene.parameters import apply_parameters
 
 Array: TypeAlias = NDArray[np.float64]
-Edit: TypeAlias = Callable[[Any], None]
+Edit: TypeAlias = Callable[[Any], object]
 
 ROOT = Path(__file__).resolve().parent.parent
 MODELS = ROOT / "models"
@@ -46,16 +46,17 @@ def spec_of(name: str) -> Any:
     return mujoco.MjSpec.from_file(str(MODELS / name / f"{name}.xml"))
 
 
-def scene_with_handle(name: str, edit: Edit | None = None, **values: float) -> tuple[Any, Any]:
-    """Compiles a scene with a handle at its grip and the coupling as site actuators.
+def scene_set_to(name: str, **values: float) -> tuple[Any, Any]:
+    """Returns a scene with a handle, in which the package wrote the values of parameters."""
+    path = MODELS / name / f"{name}.xml"
+    return scene_with_handle(name, lambda spec: apply_parameters(spec, path, values))
 
-    The package writes the values of the scene's parameters.
-    """
+
+def scene_with_handle(name: str, edit: Edit | None = None) -> tuple[Any, Any]:
+    """Compiles a scene with a handle at its grip and the coupling as site actuators."""
     spec = spec_of(name)
     if edit is not None:
         edit(spec)
-    if values:
-        apply_parameters(spec, MODELS / name / f"{name}.xml", values)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)

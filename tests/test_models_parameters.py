@@ -17,7 +17,7 @@ from model_runs import (
     moment_about_axis,
     moved_through,
     run_along_own_path,
-    scene_with_handle,
+    scene_set_to,
 )
 
 STILL = (0.0, 0.0, 0.0)
@@ -25,7 +25,7 @@ STILL = (0.0, 0.0, 0.0)
 
 @functools.cache
 def own_path_with(name: str, parameter: str, value: float) -> Run:
-    return run_along_own_path(name, *scene_with_handle(name, **{parameter: value}))
+    return run_along_own_path(name, *scene_set_to(name, **{parameter: value}))
 
 
 # --- mass: force is mass times acceleration -------------------------------------------------------
@@ -56,7 +56,7 @@ def test_force_of_a_free_tool_is_the_mass_that_was_set_times_acceleration(
     }.get(name, (0.03, 0.3))
     value = low if end == "minimum" else high
     values = {parameter: value} | ({"friction": 0.0} if name == "drawer" else {})
-    model, data = scene_with_handle(name, **values)
+    model, data = scene_set_to(name, **values)
     body = int(model.site("grip").bodyid[0])
     centre = data.xipos[body] - data.site("grip").xpos
     run = moved_through(model, data, [(0.5, MOVES[name], STILL), (0.2, MOVES[name], STILL)])
@@ -74,7 +74,7 @@ def test_force_of_a_free_tool_is_the_mass_that_was_set_times_acceleration(
 
 @pytest.mark.parametrize("mass", [0.01, 0.5])
 def test_wall_is_as_stiff_as_the_tool_is_heavy(mass: float) -> None:
-    model, data = scene_with_handle("virtual_wall", mass=mass)
+    model, data = scene_set_to("virtual_wall", mass=mass)
     run = moved_through(model, data, [(0.6, (0.011, 0, 0), STILL), (0.3, (0.011, 0, 0), STILL)])
     stiffness = run.force[-1, 0] / run.deepest[-1]
     # d² / ((1 - d) dmax² timeconst²) at d = 0.9, times the tool and 3 g of the coupling
@@ -83,7 +83,7 @@ def test_wall_is_as_stiff_as_the_tool_is_heavy(mass: float) -> None:
 
 @pytest.mark.parametrize("distance", [0.002, 0.02])
 def test_wall_stands_where_it_was_set(distance: float) -> None:
-    model, data = scene_with_handle("virtual_wall", distance=distance)
+    model, data = scene_set_to("virtual_wall", distance=distance)
     pressed = (distance + 0.001, 0.0, 0.0)
     run = moved_through(model, data, [(0.6, pressed, STILL), (0.3, pressed, STILL)])
     assert run.tool[-1, 0] - run.deepest[-1] == pytest.approx(distance, abs=1e-9)
@@ -94,7 +94,7 @@ def test_wall_stands_where_it_was_set(distance: float) -> None:
 
 @pytest.mark.parametrize("friction", [0.0, 6.0])
 def test_drawer_slides_against_the_friction_that_was_set(friction: float) -> None:
-    model, data = scene_with_handle("drawer", friction=friction)
+    model, data = scene_set_to("drawer", friction=friction)
     run = moved_through(model, data, [(2.0, (0.1, 0, 0), STILL)])
     # force and inertia's part of it cancel over a movement from rest to rest, but for the end
     sliding = slice(500, 1500)
@@ -105,7 +105,7 @@ def test_drawer_slides_against_the_friction_that_was_set(friction: float) -> Non
 
 @pytest.mark.parametrize("travel", [0.05, 0.21])
 def test_drawer_stops_at_the_travel_that_was_set(travel: float) -> None:
-    model, data = scene_with_handle("drawer", travel=travel)
+    model, data = scene_set_to("drawer", travel=travel)
     beyond = (travel + 0.002, 0.0, 0.0)
     run = moved_through(model, data, [(1.5, beyond, STILL), (0.3, beyond, STILL)])
     assert run.touched["open_stop"][-1]
@@ -118,7 +118,7 @@ def test_drawer_stops_at_the_travel_that_was_set(travel: float) -> None:
 
 @pytest.mark.parametrize("friction", [12.0, 25.0])
 def test_nail_moves_at_the_friction_that_was_set_and_not_below(friction: float) -> None:
-    model, data = scene_with_handle("hammer", nail_friction=friction)
+    model, data = scene_set_to("hammer", nail_friction=friction)
     load = 0.0
     while data.joint("nail").qpos[0] > -0.4e-3:
         load += 0.05
@@ -207,7 +207,7 @@ def test_slackened_nut_runs_with_the_torque_that_was_set_and_breaks_away_as_befo
 
 @pytest.mark.parametrize("clearance", [0.025e-3, 0.5e-3])
 def test_play_of_the_wrench_is_that_of_a_hexagon_between_two_flats(clearance: float) -> None:
-    model, data = scene_with_handle("open_wrench", clearance=clearance)
+    model, data = scene_set_to("open_wrench", clearance=clearance)
     # a rounded corner, 0.4 mm, on a circle of 8.776 mm, 30 degrees beside the flat's middle
     play = np.pi / 6 - np.arccos((0.0076 + clearance) / 0.008776)
 
@@ -225,7 +225,7 @@ def test_play_of_the_wrench_is_that_of_a_hexagon_between_two_flats(clearance: fl
 @pytest.mark.parametrize("friction", [0.05, 0.4])
 @pytest.mark.parametrize("name", ["open_wrench", "ratchet"])
 def test_friction_that_was_set_is_that_of_every_contact(name: str, friction: float) -> None:
-    model, data = scene_with_handle(name, friction=friction)
+    model, data = scene_set_to(name, friction=friction)
     if name == "open_wrench":
         data.joint("hinge").qpos[0] = np.radians(2.0)
     else:
