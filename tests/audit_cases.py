@@ -295,4 +295,5 @@ class SlowClock(SimulatedClock):
 
 
 def verdict_of(recording: Recording, folder: Path, **parts: Any) -> AuditReport:
-    return audit(rewritten(recording, folder / "tampered.mcap", **parts))
+    path = rewritten(recording, folder / "tampered.mcap", **parts)
+    return audit(path, in_process=True)

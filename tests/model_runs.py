@@ -20,9 +20,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from hapticbridge.kernel.codes import HANDLE
 from hapticbridge.scene import scene_names
+from hapticbridge.scene.parameters import apply_parameters
 
 Array: TypeAlias = NDArray[np.float64]
-Edit: TypeAlias = Callable[[Any], None]
+Edit: TypeAlias = Callable[[Any], object]
 
 ROOT = Path(__file__).resolve().parent.parent
 MODELS = ROOT / "models"
@@ -43,6 +44,12 @@ HOME_HEIGHT, BOTTOMED_HEIGHT = 0.04, -0.01
 
 def spec_of(name: str) -> Any:
     return mujoco.MjSpec.from_file(str(MODELS / name / f"{name}.xml"))
+
+
+def scene_set_to(name: str, **values: float) -> tuple[Any, Any]:
+    """Returns a scene with a handle, in which the package wrote the values of parameters."""
+    path = MODELS / name / f"{name}.xml"
+    return scene_with_handle(name, lambda spec: apply_parameters(spec, path, values))
 
 
 def scene_with_handle(name: str, edit: Edit | None = None) -> tuple[Any, Any]:

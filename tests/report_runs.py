@@ -73,6 +73,16 @@ def made_in(path: Path, mjcf: str, device: Device, coupling: Coupling, **options
     return path
 
 
+def swung(path: Path, duration: float) -> Path:
+    """A coupling too stiff for its device swings up, and no controller damps it."""
+    scene = ANVIL.replace(
+        "<worldbody>", '<custom><numeric name="simulated_hand" data="60 0"/></custom><worldbody>'
+    )
+    device = SimulatedDevice(mass=0.2, damping=0.1, hand=LIGHT_HAND)
+    coupling = Coupling(10_000.0, 0.05, 0.1, 1e-4)
+    return made_in(path, scene, device, coupling, duration=duration, controller="off")
+
+
 def active_by_method(folder: Path) -> Path:
     """A light tool under an integrator that creates energy in free motion."""
     path = folder / "method.mcap"

@@ -94,15 +94,8 @@ def tripped(folder: Path) -> Path:
 
 
 def swung(folder: Path) -> Path:
-    """A coupling too stiff for its device swings up: the run is active."""
-    scene = report_runs.ANVIL.replace(
-        "<worldbody>",
-        '<custom><numeric name="simulated_hand" data="60 0"/></custom><worldbody>',
-    )
-    device = SimulatedDevice(mass=0.2, damping=0.1, hand=report_runs.LIGHT_HAND)
-    coupling = Coupling(10_000.0, 0.05, 0.1, 1e-4)
-    path = folder / "swung.mcap"
-    return report_runs.made_in(path, scene, device, coupling, duration=1.0, controller="off")
+    """The run is active."""
+    return report_runs.swung(folder / "swung.mcap", duration=1.0)
 
 
 def weighed(folder: Path) -> Path:
@@ -319,6 +312,9 @@ LESS = "it claims less: an uncertified device, or a run without a guard"
 PUNCTUAL = "an honest run that met all its deadlines has these records"
 SHORTER = "an honest run that ended earlier has these records"
 
+NO_WRITES: tuple[Any, ...] = (
+    [["qpos", 0, [1.0]]], [["ctrl", 0, 1.0]], [["ctrl", 10**6, [1.0]]], {"a": 1}, None,
+)  # fmt: skip
 FORGERIES: dict[str, Forgery] = {
     # coupling and method
     "stiffness": seen(hand, times("stiffness")),
@@ -437,9 +433,28 @@ FORGERIES: dict[str, Forgery] = {
     "event without a tick": seen(busy, event("input", tick=None)),
     "no input": again(busy, without("input")),
     "another input": again(busy, event("input", writes=[])),
+    "an input of other numbers": again(
+        busy, event("input", writes=[["xfrc_applied", 6, [0.01, 0, 0, 0, 0, 1e-6]]])
+    ),
+    **{
+        f"an input that is none: {writes!r}": again(busy, event("input", writes=writes))
+        for writes in NO_WRITES
+    },
+    "an input before the run": seen(busy, event("input", tick=-1)),
     "input earlier": again(busy, event("input", tick=230)),
     "no change of the coupling": seen(busy, without("coupling")),
-    "another coupling": seen(busy, event("coupling", stiffness=999.0)),
+    **{
+        f"another change of the coupling: {change}": seen(busy, event("coupling", **change))
+        for change in ({"stiffness": 999.0}, {"tick": 101}, {"ticks": 1}, {"damping": -1.0})
+    },
+    **{
+        f"another switch: {change}": seen(busy, event("switch", **change))
+        for change in ({"force": True}, {"tick": 421}, {"clutch": 1})
+    },
+    **{
+        f"another reset: {change}": seen(busy, event("reset", **change))
+        for change in ({"event": "nothing"}, {"tick": 442}, {"tick": "x"})
+    },
     "no reset": seen(busy, without("reset")),
     "no trip": seen(tripped, without("trip")),
     "no trip, another end": hidden(tripped, no_trip, SHORTER),

@@ -89,7 +89,7 @@ def test_no_changed_number_is_missed(
 
 
 @pytest.mark.parametrize("name", ["flags", "contacts", "solver_iterations"])
-@pytest.mark.parametrize("bit", [0, 2, 9])
+@pytest.mark.parametrize("bit", [0, 2, 7, 9, 11])
 def test_no_changed_count_or_flag_is_missed(
     tap: Recording, folder: Path, name: str, bit: int
 ) -> None:

@@ -35,8 +35,6 @@ from hapticbridge.check.lean import MAY_GO
 from hapticbridge.check.run_faults import run_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS, Simplification
 from hapticbridge.check.version import SceneVariant, name_everything, witness
-from hapticbridge.cli import main
-from hapticbridge.cli.main import USAGE_ERROR
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.rehearsal import Setting
 from hapticbridge.device import Motion
@@ -439,14 +437,6 @@ def test_risky_change_is_taken_last(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     plain = [Simplification(name, "loses nothing", relax) for name in ("some", "more")]
     found = lean_by([1.0, 0.3, 0.8, 0.6, 0.5], [risky, *plain], tmp_path, monkeypatch)
     assert [trial.name for trial in found.together] == ["more", "some", "risky"]
-
-
-@pytest.mark.parametrize(("option", "ending"), [("write", "xml"), ("plot", "png")])
-def test_missing_folder_is_told(tmp_path: Path, option: str, ending: str, capsys: Capsys) -> None:
-    target = tmp_path / "gone" / f"x.{ending}"
-    assert main(["check", "peg_in_hole", f"--{option}", str(target)]) == USAGE_ERROR
-    said = capsys.readouterr()
-    assert ("its folder does not exist" in said.err, said.out) == (True, "")
 
 
 HINGE = """<body name="tool"><joint name="turn" axis="0 1 0" range="{}"/>

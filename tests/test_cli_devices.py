@@ -132,24 +132,6 @@ def test_serial_ports_and_boards_of_any_vendor_get_a_rule_each(
         assert rules.count(rule) == 1
 
 
-def test_every_product_of_a_vendor_with_a_library_has_a_permission(bus: Path) -> None:
-    rules = [line for line in udev_rules().splitlines() if "1451" in line and line[0] != "#"]
-    assert rules == [
-        'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device", ATTR{idVendor}=="1451", TAG+="uaccess"'
-    ]
-    (rule,) = [line for line in udev_rules().splitlines() if "2988" in line]  # its node is a port
-    assert rule == (
-        'SUBSYSTEM=="tty", ATTRS{idVendor}=="2988", ENV{ID_MM_DEVICE_IGNORE}="1", TAG+="uaccess"'
-    )
-
-
-def test_wheels_of_any_vendor_have_a_permission(bus: Path) -> None:
-    assert (
-        'SUBSYSTEM=="input", KERNEL=="event*", ENV{ID_INPUT_JOYSTICK}=="1", TAG+="uaccess"\n'
-        in udev_rules()
-    )
-
-
 @pytest.mark.parametrize(
     ("plugged", "words"),
     [

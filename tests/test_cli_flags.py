@@ -168,7 +168,6 @@ def test_a_long_help_has_two_parts(call: Called) -> None:
         ("run a --zzz", "'run' has no option '--zzz'; 'hapticbridge run --help' lists them"),
         ("run a --rate", "--rate needs a value: --rate NUMBER"),
         ("run a --rate x", "--rate is 'x'; it must be a number in Hz"),
-        ("run a --rate 0", "rate is 0.0 Hz; it must be 1 to 1000000"),
         ("run a --clutch 1.5", "--clutch is '1.5'; it must be a whole number"),
         ("run a --contact x", "--contact is 'x'; it must be one of 'rigid', 'scene'"),
         (
@@ -177,7 +176,6 @@ def test_a_long_help_has_two_parts(call: Called) -> None:
         ),
         ("run a --fast=1", "--fast takes no value"),
         ("run a --axes 1 0 0", "--axes takes 9 values, not 3"),
-        ("run a --duration 0", "duration is 0.0 s; it must be finite and > 0"),
         ("doctor --duration 0", "duration is 0.0 s; it must be 1 to 3600"),
         ("export x.mcap", "'export' needs --format NAME: hapticbridge export --format NAME FILE …"),
     ],

@@ -188,11 +188,8 @@ def test_a_sample_is_of_one_servo_tick_while_the_servo_thread_goes_on() -> None:
     assert seen
 
 
-def test_forces_that_are_no_numbers_do_not_reach_the_motors_either_way() -> None:
+def test_a_force_that_is_no_number_does_not_reach_the_motors_past_the_driver_either() -> None:
     stub, device = started()
-    for value in (math.nan, math.inf):
-        with pytest.raises(DeviceError, match="that is not finite was not sent"):
-            device.write(np.array([0.0, value, 0.0, 0, 0, 0]))
     servo: Servo = device.servo
     servo.send((math.nan, 0.0, 1.0))  # past the driver's own check
     stub.advance(stub.now + 2e-3)

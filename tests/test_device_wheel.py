@@ -20,7 +20,7 @@ from hapticbridge.device.wheel import device as wheel
 from hapticbridge.device.wheel import evdev
 from hapticbridge.device.wheel.device import WheelDevice, find, open_wheel
 from hapticbridge.device.wheel.evdev import interval_of, range_of
-from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
+from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.identify import identify
 from hapticbridge.identify.identify import measured_profile
 
@@ -263,14 +263,6 @@ def test_it_is_listed_and_what_may_not_be_opened_is_not() -> None:
         evdev.open_node(model, PATH)
 
 
-def test_a_torque_that_is_not_finite_is_not_sent() -> None:
-    device, model = started()
-    for value in (math.nan, math.inf):
-        with pytest.raises(DeviceError, match="a torque that is not finite was not sent"):
-            device.write(np.where(TWIST, value, 0.0))
-    assert model.torque() == 0.0
-
-
 def test_rate_and_range_are_those_that_the_kernel_shows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -336,18 +328,6 @@ def test_it_turns_a_hinge_against_a_stop_and_the_run_is_audited(tmp_path: Path) 
     (condition,) = summary.conditions
     assert condition.startswith("rotation: device damping 0.1 >= ")
     assert "without delay, which is unknown" in condition
-
-
-def test_an_unplugged_wheel_trips_the_run(tmp_path: Path) -> None:
-    (tmp_path / "knob.xml").write_text(HINGE)
-    scene = hb.load_scene(tmp_path / "knob.xml", grip="grip")
-    device, model = opened(WheelModel(held(0.2)))
-    with (
-        hb.Bridge(scene, device, clock=DrivingClock(model)) as bridge,
-        pytest.raises(SafetyTrip, match="is gone: the device was unplugged"),
-    ):
-        bridge.run(1.0, on_tick=lambda tick: setattr(model, "is_plugged", tick < 150))
-    assert model.files == 0
 
 
 def test_identify_measures_its_inertia_and_damping() -> None:

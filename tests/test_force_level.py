@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,13 +18,13 @@ from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.codes import OK
 from hapticbridge.run.description import parameters_of
 
-ATTACKS = 100
+ATTACKS = 40
 """Number of random attacks; ``scripts/attack`` makes as many as it is asked for."""
 
 
-@pytest.mark.parametrize("start", range(0, ATTACKS, 50))
+@pytest.mark.parametrize("start", range(0, ATTACKS, 20))
 def test_no_hand_gets_energy_out(start: int) -> None:
-    for seed in range(start, start + 50):
+    for seed in range(start, start + 20):
         attack = Attack.at_random(seed)
         energy, _, code = attack.run()
         assert code == OK
@@ -31,7 +32,7 @@ def test_no_hand_gets_energy_out(start: int) -> None:
 
 
 def test_no_hand_gets_energy_out_of_late_samples() -> None:
-    for seed in range(1000, 1030):
+    for seed in range(1000, 1012):
         attack = Attack.at_random(seed, late=3.0)
         energy, _, _ = attack.run()
         assert energy <= UNPAID, attack
@@ -42,14 +43,16 @@ def test_hands_saturate_the_coupling() -> None:
     assert saturated > 2000
 
 
-def test_a_limit_on_the_device_alone_is_seen_to_fail() -> None:
-    worst = max(
-        Attack.at_random(
-            seed, scene=scene, kind=1, presses=False, tunes=False, is_limited_alone=True
-        ).run(ticks)[0]
-        for seed, scene, ticks in ((52, "point_mass", 8000), (68, "peg_in_hole", 2000))
-    )
-    assert worst > 0.05
+@pytest.mark.parametrize(
+    ("seed", "scene", "ticks"), [(52, "point_mass", 8000), (68, "peg_in_hole", 2000)]
+)
+def test_a_limit_on_the_device_alone_is_seen_to_fail_where_the_level_holds(
+    seed: int, scene: str, ticks: int
+) -> None:
+    own: dict[str, Any] = {"scene": scene, "kind": 1, "presses": False, "tunes": False}
+    alone = Attack.at_random(seed, is_limited_alone=True, **own).run(ticks)[0]
+    level = Attack.at_random(seed, **own).run(ticks)[0]
+    assert level <= UNPAID < 1e-3 < alone, (level, alone)
 
 
 STRETCHING, DAMPING = 100, 2.0

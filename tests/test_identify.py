@@ -67,7 +67,7 @@ def test_random_devices_are_measured_to_a_part_of_what_is_asked(seed: int) -> No
 def test_the_stated_interval_holds_the_true_value_nine_times_in_ten() -> None:
     held = {"mass": 0, "damping": 0, "friction": 0, "delay": 0}
     width = []
-    for seed in range(80):
+    for seed in range(40):
         true = known(seed)
         fit = measured(true, ("x",), 5.0).fits["x"]
         for name in held:
@@ -75,7 +75,7 @@ def test_the_stated_interval_holds_the_true_value_nine_times_in_ten() -> None:
             estimate = getattr(fit, name)
             held[name] += estimate.least <= value <= estimate.most
         width.append(fit.damping.half_width / true["damping"])
-    assert min(held.values()) >= 72, held
+    assert min(held.values()) >= 36, held
     assert np.median(width) < 0.03  # an interval that holds everything says nothing
 
 

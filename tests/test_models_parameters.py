@@ -6,32 +6,21 @@ Measured in runs without the package, but for the numbers that it writes into th
 from __future__ import annotations
 
 import functools
-from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 from model_runs import (
-    MODELS,
     K,
     Run,
     T,
     moment_about_axis,
     moved_through,
     run_along_own_path,
-    scene_with_handle,
+    scene_set_to,
 )
 
-from hapticbridge.scene.parameters import apply_parameters
-
 STILL = (0.0, 0.0, 0.0)
-
-
-def scene_set_to(name: str, **values: float) -> tuple[Any, Any]:
-    def edit(spec: Any) -> None:
-        apply_parameters(spec, MODELS / name / f"{name}.xml", values)
-
-    return scene_with_handle(name, edit)
 
 
 @functools.cache

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import model_runs as reference
 import mujoco
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
 from hapticbridge.device import Motion, TrajectoryDevice
-from hapticbridge.scene.parameters import apply_parameters
 
 FORCE_LIMIT = 10.0  # N, of the default simulated device
 TASKS = (
@@ -192,15 +190,6 @@ def test_walls_leave_little_more_than_sixth_of_turn(asked: float, wall: str, sto
     assert np.degrees(run.joints[-1, 4]) == pytest.approx(stop, abs=0.6)
 
 
-def scene_with(name: str, **values: float) -> tuple[Any, Any]:
-    """Returns model and data of a scene with parameters, the coupling attached by hand."""
-
-    def edit(spec: Any) -> None:
-        apply_parameters(spec, reference.MODELS / name / f"{name}.xml", values)
-
-    return reference.scene_with_handle(name, edit)
-
-
 # --- pliers ---------------------------------------------------------------------------------------
 
 GRIP_DISTANCE = 0.1  # m, from the hinge
@@ -269,7 +258,7 @@ def test_wire_stays_crushed_and_is_met_later_the_second_time() -> None:
 
 @pytest.mark.parametrize(("distance", "degrees"), [(0.012, 5.0), (0.02, 8.5), (0.03, 10.0)])
 def test_jaw_presses_with_handles_force_times_lever(distance: float, degrees: float) -> None:
-    model, data = scene_with("bench_pliers", wire_distance=distance)
+    model, data = reference.scene_set_to("bench_pliers", wire_distance=distance)
     run = reference.moved_through(model, data, reference.swung(-degrees, -degrees))
     assert data.ncon == 1
     force = np.zeros(6)
@@ -282,7 +271,7 @@ def test_jaw_presses_with_handles_force_times_lever(distance: float, degrees: fl
 def test_a_wire_that_is_too_strong_holds() -> None:
     runs = []
     for strength in (16.0, 40.0):
-        model, data = scene_with("bench_pliers", yield_force=strength)
+        model, data = reference.scene_set_to("bench_pliers", yield_force=strength)
         runs.append(reference.moved_through(model, data, reference.swung(-7.5, -7.5)))
     assert runs[0].joints[-1, 0] > 0.15e-3
     # pressed with 26 N, it creeps by 0.04 mm/s
@@ -396,7 +385,7 @@ SLACKENED_SCREW = 540.0  # degrees
 
 def turned_slowly(name: str, degrees: float, **values: float) -> reference.Run:
     """Presses the tool by 1 mm, then swings the handle about the screw at 10 degrees a second."""
-    model, data = scene_with(name, **values)
+    model, data = reference.scene_set_to(name, **values)
     count = round(abs(degrees) / 10.0 / reference.T)
     angle = np.radians(np.concatenate([np.zeros(300), np.linspace(0.0, degrees, count)]))
     press = np.minimum(np.arange(len(angle)) / 300.0, 1.0)
@@ -485,7 +474,7 @@ def play_of(name: str, clearance: float) -> float:
      for c in (0.02e-3, 0.05e-3, most)],
 )  # fmt: skip
 def test_play_in_the_recess_is_what_the_clearance_leaves(name: str, clearance: float) -> None:
-    model, data = scene_with(name, clearance=clearance)
+    model, data = reference.scene_set_to(name, clearance=clearance)
     play = play_of(name, clearance)
     seats = round(360.0 / STROKE[name])
     for seat in range(seats):
@@ -506,7 +495,7 @@ def tilted_and_turned(degrees: float, towards: float) -> reference.Run:
         degrees: Of the tilt.
         towards: In which direction, in degrees from an arm of the recess.
     """
-    model, data = scene_with("screwdriver")
+    model, data = reference.scene_with_handle("screwdriver")
     grip, tip = 60e-3, -3.1e-3
     sideways = np.array([-np.sin(np.radians(towards)), np.cos(np.radians(towards)), 0.0])
     poses = [(0.3, (0.0, 0.0, -1e-3), (0.0, 0.0, 0.0))]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -13,14 +12,12 @@ import pytest
 from kernel_runs import Array, Run, T, go_on, load, run_of, samples_of, unlimited
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import METHODS, prepare
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
-from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.description import method_of
 from hapticbridge.run.options import BridgeOptions
 from hapticbridge.scene import Scene, load_scene
@@ -627,25 +624,6 @@ def test_a_force_limit_and_a_tank_hold_together(level: float) -> None:
     assert force.max() == pytest.approx(level)
     assert (work.given <= SPENDABLE * np.maximum(work.tank[:-1], 0.0) + 1e-15).all()
     assert strict(run)
-
-
-@pytest.mark.parametrize("contact", ["rigid", "scene"])
-def test_a_recorded_contact_is_read_back_and_repeated(contact: str, tmp_path: Path) -> None:
-    from hapticbridge.audit import audit
-
-    path = tmp_path / "run.mcap"
-    with Bridge(
-        "peg_in_hole",
-        clock=SimulatedClock(),
-        contact=contact,
-        recording=path,
-        pipelined=True,
-    ) as bridge:
-        bridge.run(2.5)
-        assert bridge.session.parameters.is_rigid == (contact == "rigid")
-    report = audit(path)
-    assert (report.verdict, report.environment) == ("passive", "strict")
-    assert report.resimulation == "bit for bit"
 
 
 # The option

@@ -242,7 +242,7 @@ def test_what_is_no_coupling_hand_or_body_is_refused(value: Any) -> None:
             p.SampledLoop(COUPLING, T).simulate(value, 10)
 
 
-@pytest.mark.parametrize("name", [None, [], {}, ["backward"], np.array(["tustin"]), 1])
+@pytest.mark.parametrize("name", ["forward", None, [], {}, ["backward"], np.array(["tustin"]), 1])
 def test_what_is_no_name_is_refused_with_the_names(name: Any) -> None:
     for call in (
         lambda: p.minimum_damping(COUPLING, T, discretization=name),

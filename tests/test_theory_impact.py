@@ -170,7 +170,6 @@ def hit(velocity: Any = (0.8, -1.0), friction: Any = 0.5, *rest: Any, **named: A
         (lambda: hit([np.nan, -1]), "velocity is nan m/s; it must be finite"),
         (lambda: hit([1, 2, -3]), r"velocity has shape \(3,\)"),
         (lambda: hit((1, -1), [0.1, 0.2], [0.1, 0.2, 0.3]), "do not broadcast"),
-        (lambda: hit(law="hertz"), "choose one of 'newton', 'poisson', 'stronge'"),
         (lambda: ImpactBody(0, 1, [0, 0]), "mass is 0 kg; it must be finite and > 0"),
         (lambda: ImpactBody(1, -1, [0, 0]), "inertia is -1 kg m²"),
         (lambda: ImpactBody(1, 1, [0, np.inf]), "arm is inf m"),

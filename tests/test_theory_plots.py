@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,8 +9,6 @@ from hypothesis import strategies as st
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.plots import alternatives
-from hapticbridge.errors import HapticBridgeError
-from hapticbridge.plotting import check_ending, new_figure, write_picture
 
 T = 1e-3
 
@@ -53,13 +49,3 @@ def test_each_spectrum_reaches_what_its_alternative_needs() -> None:
         if way.frequency is not None:
             nearest = frequency[np.nanargmax(needed)]
             assert nearest == pytest.approx(way.frequency, rel=2e-2)
-
-
-def test_picture_that_cannot_be_written_is_refused_in_a_sentence(tmp_path: Path) -> None:
-    figure = new_figure(4, 3)
-    with pytest.raises(HapticBridgeError, match=r"must end in \.pdf"):
-        check_ending(Path("x.jpeg"))
-    with pytest.raises(HapticBridgeError, match="must end in"):
-        write_picture(figure, tmp_path / "x")
-    with pytest.raises(HapticBridgeError, match=r"write '.*x\.png': its folder does not exist"):
-        write_picture(figure, tmp_path / "no" / "x.png")

@@ -228,7 +228,6 @@ ONES = np.ones(5)
         (lambda: integrate_particle(0, ONES, T, "explicit"), "mass is 0 kg; it must be"),
         (lambda: integrate_particle(np.nan, ONES, T, "explicit"), "mass is nan kg; it must"),
         (lambda: integrate_particle(1, ONES, -1, "explicit"), "period is -1 s"),
-        (lambda: integrate_particle(1, ONES, T, "euler"), "'midpoint', 'semi_implicit'"),  # type: ignore[arg-type]
         (lambda: integrate_particle(1, [1.0], T, "explicit"), r"force has shape \(1,\)"),
         (lambda: integrate_particle(1, ["a"], T, "explicit"), "must be numbers in N"),
         (lambda: integrate_particle([1, 2], np.ones((5, 3)), T, "explicit"), "do not broadcast"),

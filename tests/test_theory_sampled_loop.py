@@ -197,7 +197,6 @@ def test_nyquist_hand_has_no_reactance_left_from_rounding(period: float) -> None
         (lambda: SampledLoop(WALL, 1e-3, delay=1.5), "delay"),  # type: ignore[arg-type]
         (lambda: SampledLoop(WALL, 1e-3, filter_time=math.nan), "filter time"),
         (lambda: SampledLoop(WALL, 1e-3, integrator="leapfrog"), "'implicit', 'semi_implicit'"),  # type: ignore[arg-type]
-        (lambda: SampledLoop(WALL, 1e-3, discretization="forward"), "'backward', 'tustin'"),  # type: ignore[arg-type]
         (lambda: SampledLoop(WALL, 1e-3).simulate(WorstHand(1, 100, 2e-3), 10), r"0\.002 s, the l"),
         (lambda: SampledLoop(WALL, 1e-3).simulate(WorstHand(1, 100, 1e-3), 0), "run is 0"),
     ],

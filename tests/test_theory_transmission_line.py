@@ -97,7 +97,6 @@ def test_line_ended_by_the_device_counts_the_hands_work(b_share: float, gains: b
         ({"period": -1.0}, "period"),
         ({"frequency": 4000.0}, "half the sampling rate"),
         ({"round_trip": 0}, "round trip"),
-        ({"terminated_by": "wall"}, "'device', 'software'"),
     ],
 )
 def test_bad_arguments_are_refused_in_a_sentence(arguments: dict[str, float], named: str) -> None:

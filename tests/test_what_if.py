@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +32,15 @@ from hapticbridge.run.description import SOURCE_PREFIX
 from hapticbridge.run.options import Workspace
 from hapticbridge.scene import load_scene
 from hapticbridge.units import format_si
-from hapticbridge.whatif import WhatIf, WhatIfRun, what_if, write_what_if
+from hapticbridge.whatif import WhatIf, WhatIfRun, write_what_if
+from hapticbridge.whatif import what_if as confined_what_if
 from hapticbridge.whatif.recorded import RecordedRun
 from hapticbridge.whatif.replayed_hand import Repetition, intended
 
 DURATION = 0.4
+
+what_if = partial(confined_what_if, in_process=True)
+"""The child process is tested in ``test_recorded_scene``."""
 
 
 @pytest.fixture(scope="module")
@@ -56,36 +60,6 @@ def softer(wall: Path) -> WhatIf:
 
 def run_of(found: WhatIf, name: str) -> WhatIfRun:
     return next(run for run in found.runs if run.name == name)
-
-
-TURNED = [[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]]
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"workspace": Workspace(scale=1.7, force_scale=0.9), "substeps": 3, "rate": 700},
-        {"method": "compensated", "rate": 3000, "workspace": Workspace(axes=TURNED)},
-        {"method": "direct"},
-    ],
-)
-def test_nothing_changed_is_the_recorded_run_again(options: dict[str, Any], tmp_path: Path) -> None:
-    """To the bit, whatever the bridge was asked for; inputs and the ramp are repeated too."""
-    path = tmp_path / "run.mcap"
-    motion = tmp_path / "tap.csv"
-    motion.write_text(TAP)
-
-    def push(bridge: Bridge, tick: int) -> None:
-        if tick in (20, 40) and options.get("method") != "direct":  # which meters no inputs
-            bridge.set_input(body_wrench={"peg": [0.05, 0, 0, 0, 0, 0]})
-
-    recorded(path, "peg_in_hole", f"simulated:path={motion}", duration=0.1, on_tick=push, **options)
-    found = what_if(path, {})
-    same_in_every_bit(found.runs[1], found.runs[0])
-    assert np.ptp(found.runs[0].ticks["tool_position"], axis=0).max() > 1e-3
-    assert found.runs[1].report.resimulation == "bit for bit"
-    assert any("the recorded one in every bit" in note for note in found.notes)
 
 
 def same_in_every_bit(one: WhatIfRun, other: WhatIfRun) -> None:
@@ -108,7 +82,9 @@ def test_another_digit_in_the_last_place_is_told(wall: Path, tmp_path: Path) -> 
 
 
 def commanded(bridge: Bridge, tick: int) -> None:
-    """Force off and on, another coupling, a reset."""
+    """A push, force off and on, another coupling, a reset."""
+    if tick in (10, 20):
+        bridge.set_input(body_wrench={"peg": [0.05, 0, 0, 0, 0, 0]})
     asked: dict[int, Command] = {
         30: Switch(force=False),
         60: Switch(force=True),
@@ -128,6 +104,7 @@ def test_commands_are_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     recorded(path, "peg_in_hole", device, duration=0.22, on_tick=commanded)
     found = what_if(path, {})
     same_in_every_bit(found.runs[1], found.runs[0])
+    assert found.runs[1].report.events["input"] == 2
     names = [event["event"] for event in found.runs[2].recording.events]
     assert (names.count("switch"), names.count("coupling"), names.count("reset")) == (4, 1, 1)
     stiff = what_if(path, {"stiffness": 2000})
@@ -240,13 +217,8 @@ def test_what_the_hand_wanted_is_found_where_it_is_known() -> None:
     ticks = np.zeros(len(time), TICK_DTYPE)
     ticks["device_position"][:, 0] = size * (1 - np.cos(omega * time))
     ticks["device_quaternion"][:, 0] = 1.0
-    info = DeviceInfo.from_json(
-        json.dumps(
-            dict.fromkeys(DeviceInfo.__dataclass_fields__)
-            | {"name": "d", "axes": ["x", "y", "z"], "mass": 0.1, "damping": 2.0, "serial": ""}
-            | {"force_limit": 10, "torque_limit": 0, "speed_limit": 1}
-            | {"is_prescribed": False, "is_real": False, "delay": 0.0, "sensed": []}
-        )
+    info = DeviceInfo(
+        name="d", axes=("x", "y", "z"), force_limit=10, mass=0.1, damping=2.0, delay=0.0
     )
     hand = Hand()
     table = intended(info, hand, ticks, period, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
@@ -317,20 +289,6 @@ def test_motions_are_told_apart_by_rate(wall: Path) -> None:
     np.testing.assert_allclose(after[1:-1:2], middle, rtol=0, atol=1e-12)
 
 
-LIGHTLY_HELD = report_runs.ANVIL.replace(
-    "<worldbody>", '<custom><numeric name="simulated_hand" data="60 0"/></custom><worldbody>'
-)
-"""A tool that stays where it is, and a hand that burns nothing: a stiff spring swings up."""
-
-TOO_STIFF = Coupling(10_000.0, 0.05, 0.1, 1e-4)
-
-
-def swung(path: Path, controller: str | None, duration: float = 0.1) -> Path:
-    device = SimulatedDevice(mass=0.2, damping=0.1, hand=report_runs.LIGHT_HAND)
-    options: dict[str, Any] = {"duration": duration, "controller": controller}
-    return report_runs.made_in(path, LIGHTLY_HELD, device, TOO_STIFF, **options)
-
-
 @pytest.mark.parametrize("button", ["clutch", "dead_man"])
 def test_a_button_does_again_what_it_did(button: str, tmp_path: Path) -> None:
     path = tmp_path / "pressed.mcap"
@@ -363,19 +321,10 @@ def drift(step: float) -> Callable[[int], tuple[float, ...]]:
     return lambda tick: (step * tick, 0, 0, 1, 0, 0, 0)
 
 
-EVERY_LIMIT = Limits(
-    force=3.0,
-    torque=0.2,
-    ramp=0.02,
-    stretch=0.1,
-    angle=1.0,
-    energy=math.inf,
-    reach=0.5,
-)
 REPEATED: dict[str, tuple[ScriptedDevice, dict[str, Any], TickFlag]] = {
     "limits": (
         ScriptedDevice(lambda tick: (0.004 * (tick > 60), 0, 0, 1, 0, 0, 0)),
-        {"limits": EVERY_LIMIT, "workspace": Workspace(scale=2.0)},
+        {"limits": Limits(force=3.0, torque=0.2, ramp=0.02), "workspace": Workspace(scale=2.0)},
         TickFlag.FORCE_LIMITED,
     ),
     "the edge of the reach": (
@@ -401,10 +350,7 @@ def test_what_the_guard_did_comes_back_in_every_bit(name: str, tmp_path: Path) -
     before, after = (run.ticks for run in found.runs[:2])
     assert (before["flags"] & int(flag)).any()
     assert before.tobytes() == after.tobytes()
-    if name == "limits":
-        [run] = RecordedRun.from_hands([read_recording(path)], tmp_path / "scene")
-        assert run.request.options.limits == EVERY_LIMIT
-    elif name == "old samples":
+    if name == "old samples":
         slower = what_if(path, {"rate": 700}).runs[1]
         for ticks in (before, slower.ticks):  # it has faded
             assert np.abs(ticks["wrench_on_device"][-1]).max() == 0.0
@@ -415,7 +361,7 @@ def test_what_the_guard_did_comes_back_in_every_bit(name: str, tmp_path: Path) -
 
 
 def test_a_model_hand_feels_the_controller_that_is_asked_for(tmp_path: Path) -> None:
-    path = swung(tmp_path / "run.mcap", "off", duration=1.4)
+    path = report_runs.swung(tmp_path / "run.mcap", duration=1.4)
     ticks = {}
     for name in ("off", "damper"):
         found = what_if(path, {"controller": name})
@@ -472,10 +418,7 @@ def test_several_values_of_a_setting_stand_side_by_side(wall: Path, call: Called
     assert code == 0
     assert "stiffness 500" in out
     assert "stiffness 900" in out
-    alone = [
-        what_if(wall, {"stiffness": k, "damping": 0.7}, in_process=True).runs[-1]
-        for k in (500, 900)
-    ]
+    alone = [what_if(wall, {"stiffness": k, "damping": 0.7}).runs[-1] for k in (500, 900)]
     for run in alone:
         assert format_si(run.peaks["force on tool"], "N") in out
     code, _, err = call("audit", wall, "--what-if", "stiffness=5,9", "--what-if", "damping=1,2")
