@@ -88,7 +88,7 @@ def test_a_refusal_names_a_quantity_in_words(make: Callable[[], object], message
             SIMULATED,
             BridgeOptions(limits=Limits(force=11.0, torque=0.1)),
             RealClock(),
-            "force limit is 11 N; the device 'model' bears 10 N",
+            "force limit is 11 N; device 'model' allows at most 10 N",
         ),
         (SIMULATED, BridgeOptions(contact_stiffness=1e3), RealClock(), "only 'direct' takes it"),
     ],

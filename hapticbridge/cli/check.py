@@ -291,8 +291,8 @@ class Check:
     """Find what is wrong with a scene, and what a tick of it costs.
 
     Leads the scene through its hand's motion and names every fault with the line to change. Exit
-    code 0 if nothing is wrong, 1 if something is, 2 if the scene cannot be read. What is only worth
-    knowing, such as what a run changes by itself, is nothing wrong.
+    code 0 if nothing is wrong, 1 if something is, 2 if the scene cannot be read. Notes, such as
+    changes that a run makes by itself, do not affect the exit code.
 
     Example:
         hapticbridge check my_tool.xml --lean --write lean.xml

@@ -108,8 +108,8 @@ def announce(setup: RunSetup, given: Mapping[str, float], *, is_method_chosen: b
     reach = setup.guard.reach
     if reach < math.inf:
         err.print(
-            f"  {format_si(reach, 'm')} from its middle the device is at the end of its "
-            "reach: beyond, it moves without the handle and without force"
+            f"  the device reaches {format_si(reach, 'm')} from its centre; beyond that the "
+            "handle stays and no force acts"
         )
     if not method.has_law:
         return  # printed once the weld is measured: ``announce_measured``

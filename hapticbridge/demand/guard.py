@@ -141,7 +141,7 @@ def limits_for(info: DeviceInfo, limits: Limits) -> Limits:
         chosen[name] = most if requested == math.inf else requested
         if chosen[name] > most and not info.is_prescribed:
             raise DeviceError(
-                f"{name} limit is {requested:g} {unit}; the device '{info.name}' bears "
+                f"{name} limit is {requested:g} {unit}; device '{info.name}' allows at most "
                 f"{most:g} {unit}"
             )
     return replace(limits, **chosen)
