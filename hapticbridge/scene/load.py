@@ -144,8 +144,8 @@ def load_scene(
             ``grips``, else the site ``grip``.
         as_is: If true, a scene is refused that must be changed to be felt (options that exclude the
             coupling, force limits of joints, a tool inside something); else it is changed, and
-            ``Scene.changes`` lists the changes. A small memory (``LEAST_MEMORY``) is enlarged either
-            way, because that alters no motion.
+            ``Scene.changes`` lists the changes. A small memory (``LEAST_MEMORY``) is enlarged in
+            both cases, because that alters no motion.
         **parameters: Values of the scene's parameters, such as ``clearance=0.1e-3``.
             ``scene.scene_parameters`` and ``hapticbridge scenes NAME`` list them. A specification
             has none.
