@@ -371,8 +371,8 @@ def test_a_signal_at_any_moment_of_start_up_leaves_neither_file_nor_process(
     call: Called, unheeded: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hapticbridge.view.window.check_view", lambda: None)
-    monkeypatch.setattr("hapticbridge.view.window._BOOTSTRAP", SPECTATOR)
-    monkeypatch.setattr("hapticbridge.view.window.PATIENCE", 0.05)  # it does not end by itself
+    ends = SPECTATOR.replace("while True:", "while sys.stdin.buffer.readline():")
+    monkeypatch.setattr("hapticbridge.view.window._BOOTSTRAP", ends)
     run = ("run", "point_mass", "--fast", "--overwrite", "--view", "--port", 0)
     monkeypatch.setattr("hapticbridge.cli.run.device_for", lambda *_: ScriptedDevice(still))
     for _ in range(2):  # the first one compiles
