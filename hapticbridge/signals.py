@@ -102,7 +102,8 @@ class Interrupts:
     """Stop signals as exceptions, until a run takes them over.
 
     Code in C may swallow the exception of a signal, such as a callback of the importer or of the
-    compiler. ``check`` raises it again, and so does a timer after ``RELEASE_TIME``.
+    compiler. ``check`` raises it again, and so does a timer after ``RELEASE_TIME`` unless resources
+    are being released then: a busy machine may stretch that.
     """
 
     def __init__(self) -> None:
@@ -128,6 +129,8 @@ class Interrupts:
             raise StopSignal(self.number)
 
     def _repeat(self, thread: int) -> None:
+        if _is_handling_stop(thread):
+            return
         if hasattr(signal, "pthread_kill"):  # it also ends a wait of that thread
             signal.pthread_kill(thread, self.number)
         else:
@@ -147,6 +150,15 @@ class Interrupts:
         """Passes the names of later signals to a function; raises ``StopSignal`` if one came."""
         self._taker = taker
         self.check()
+
+
+def _is_handling_stop(thread: int) -> bool:
+    """Returns whether a ``StopSignal`` has arrived in a thread, whose ``finally`` blocks run."""
+    handled: Any = sys._current_exceptions().get(thread)
+    error = handled[1] if isinstance(handled, tuple) else handled  # until 3.11 as exc_info
+    while error is not None and not isinstance(error, StopSignal):
+        error = error.__context__
+    return error is not None
 
 
 ENDING_SIGNALS = tuple(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
+import signal
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,11 +25,43 @@ from report_runs import Made
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.cli import main
 from hapticbridge.recording import Recording, read_recording
+from hapticbridge.signals import STOP_SIGNALS
 
 # a deadline is a timing, and other work on the machine must fail no test; half of the usual
 # examples, for other ones are drawn in each run
 settings.register_profile("hapticbridge", deadline=None, max_examples=50)
 settings.load_profile("hapticbridge")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def usual_signals() -> Iterator[None]:
+    """Handles stop signals as a terminal's processes do, whatever the caller ignores or blocks.
+
+    ``nohup`` leaves SIGHUP ignored, a background job of a shell SIGINT; children inherit that.
+    """
+    ignored = [number for number in STOP_SIGNALS if signal.getsignal(number) is signal.SIG_IGN]
+    for number in ignored:
+        usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+        signal.signal(number, usual)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
+    yield
+    for number in ignored:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Counts skipped tests by reason: a line for each of the two most frequent, one for the rest.
+
+    Names in quotation marks and brackets are left out of a reason.
+    """
+    skipped = terminalreporter.stats.get("skipped", [])
+    reasons = (str(report.longrepr[-1]).removeprefix("Skipped: ") for report in skipped)
+    kinds = Counter(re.sub(r"'[^']*'", "…", re.split(r" \(|: ", each)[0]) for each in reasons)
+    lines = [f"{count} skipped: {kind}" for kind, count in kinds.most_common()]
+    rest = [", ".join(lines[2:])] if len(lines) > 2 else []
+    for line in [*lines[:2], *rest]:
+        terminalreporter.write_line(line)
 
 
 PROCESSES = ("test_bridge_killed", "test_cli_run", "test_realtime", "test_recording_recorder")

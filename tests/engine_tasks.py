@@ -6,14 +6,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-import pytest
 from closed_forms import swing_from_rest
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion
-from hapticbridge.errors import StudyError
-from hapticbridge.lab.engines.base import Body, Engine, Shape, Simulation, Task, open_engine
+from hapticbridge.lab.engines.base import Body, Engine, Shape, Simulation, Task, available_engines
+
+HERE = available_engines()
+"""Engines of this installation; tests are collected for these alone."""
 
 COUPLING = Coupling(
     stiffness=1000.0, damping=5.0, rotational_stiffness=2.0, rotational_damping=2e-3
@@ -21,13 +22,6 @@ COUPLING = Coupling(
 AMPLITUDE, FREQUENCY, SECONDS = 0.01, 2.0, 0.5
 MASS = 1.0
 GRAVITY = 9.81
-
-
-def engine_or_skip(name: str) -> Engine:
-    try:
-        return open_engine(name)
-    except StudyError as error:
-        pytest.skip(str(error))
 
 
 @contextmanager

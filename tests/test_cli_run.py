@@ -20,7 +20,7 @@ from audit_cases import ScriptedDevice
 from bridge_runs import still, sway
 from cli_cases import Called, one_sentence
 from faults.catalogue import SPECTATOR
-from faults.processes import PATIENCE, STOPS, children
+from faults.processes import PATIENCE, STOPS, children, is_alive
 
 from hapticbridge.audit import audit
 from hapticbridge.cli import main
@@ -355,8 +355,8 @@ def test_a_signal_at_any_moment_of_start_up_leaves_neither_file_nor_process(
     call: Called, unheeded: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hapticbridge.view.window.check_view", lambda: None)
-    monkeypatch.setattr("hapticbridge.view.window._BOOTSTRAP", SPECTATOR)
-    monkeypatch.setattr("hapticbridge.view.window.PATIENCE", 0.05)  # it does not end by itself
+    ends = SPECTATOR.replace("while True:", "while sys.stdin.buffer.readline():")
+    monkeypatch.setattr("hapticbridge.view.window._BOOTSTRAP", ends)
     run = ("run", "point_mass", "--fast", "--overwrite", "--view", "--port", 0)
     monkeypatch.setattr("hapticbridge.cli.run.device_for", lambda *_: ScriptedDevice(still))
     for _ in range(2):  # the first one compiles
@@ -377,16 +377,23 @@ def test_a_signal_at_any_moment_of_start_up_leaves_neither_file_nor_process(
         name, is_over = list(STOPS)[number % 3], threading.Event()
 
         def strike(seconds: float, name: str = name, is_over: Any = is_over) -> None:
-            while not is_over.wait(seconds):  # again, should it come before the command listens
+            # again only where it came before the command listened: a release that a busy machine
+            # stretches must not meet a second one
+            while not is_over.wait(seconds):
+                unheeded.clear()
                 os.kill(os.getpid(), signal.Signals[name])
-                seconds = 5.0
+                while not (unheeded or is_over.wait(1e-3)):
+                    pass
+                seconds = 0.1
 
         thread = threading.Thread(target=strike, args=(moment,))
         thread.start()
         code, _, err = call(*run, "--record", path)
         is_over.set()
         thread.join(PATIENCE)
-        assert set(children(os.getpid())) <= set(before)
+        limit = time.monotonic() + PATIENCE  # a busy machine takes its time to end a killed one
+        while left := set(filter(is_alive, children(os.getpid()))) - set(before):
+            assert time.monotonic() < limit, left
         assert not any(map(np.any, device.writes))
         if code in {0, 1}:  # it ran
             assert len(read_recording(path).ticks) > 0 and device.is_closed

@@ -1,8 +1,7 @@
 """Runs, audits and printed words are what they were when ``scripts/freeze`` froze them.
 
-Fields, words, verdicts and numbers are held to on every machine. Bits are held to where they were
-frozen. Elsewhere the audit finds the bits of the live loop again, and so does the compiled sweep
-(``test_lab_closed_loop``).
+Fields, words, verdicts, counts and numbers are held to on every machine; bits where they were
+frozen. On every machine the audit and the compiled sweep find the bits of the live loop again.
 """
 
 from __future__ import annotations
@@ -14,9 +13,18 @@ from pathlib import Path
 from typing import Any
 
 import golden_cases as golden
+import numpy as np
 import pytest
 
+import hapticbridge as hb
+from hapticbridge.audit import audit
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.kernel.record import CLOCK_FIELDS
+from hapticbridge.lab.closed_loop import ClosedLoop
+from hapticbridge.lab.methods import METHODS
+
 RUNS = golden.runs()
+SWEPT = ("point_mass", "virtual_wall", "peg_in_hole")
 
 
 def hold(frozen: Any, found: Any) -> None:
@@ -38,8 +46,52 @@ def frozen(path: Path) -> Any:
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_a_run_gives_the_records_that_were_frozen(name: str, tmp_path: Path) -> None:
-    hold(frozen(golden.RUNS)[name], RUNS[name].digests(tmp_path))
+def test_a_run_gives_the_records_that_were_frozen_and_the_audit_finds(
+    name: str, tmp_path: Path
+) -> None:
+    record = tmp_path / "run.mcap"
+    hold(frozen(golden.RUNS)[name], RUNS[name].digests(tmp_path, recording=record))
+    assert audit(record).resimulation == "bit for bit"
+
+
+@pytest.mark.parametrize("method", [*golden.METHODS, "explicit"])
+@pytest.mark.parametrize("scene", SWEPT)
+def test_sweep_and_audit_find_the_bits_of_the_live_loop(
+    scene: str, method: str, tmp_path: Path
+) -> None:
+    def device() -> SimulatedDevice:
+        return SimulatedDevice(
+            damping=3.0,
+            resolution=1e-6,
+            friction=0.02,
+            delay=1,
+            path=f"models/{scene}/{scene}.csv",
+            force_limit=1e9,
+            torque_limit=1e9,
+        )
+
+    live = golden.Run(
+        scene,
+        device,
+        {
+            "coupling": golden.COUPLING,
+            "method": method,
+            "limits": {"force": 1e9, "torque": 1e9, "ramp": 0.0},
+            "controller": "off",  # a sweep looks at methods without one
+        },
+        seconds=1.5,
+    )
+    with live.open(tmp_path, recording=tmp_path / "run.mcap") as bridge:
+        expected = live.go(bridge)
+        summary = bridge.summary()
+    swept = ClosedLoop(hb.load_scene(scene)).run(
+        device(), golden.COUPLING, METHODS[method], period=1e-3, ticks=1500, keep_records=True
+    )
+    assert len(swept.records) == len(expected) == 1500
+    assert (swept.environment, swept.fault) == (summary.environment, summary.fault)
+    for name in set(expected.dtype.names or ()) - set(CLOCK_FIELDS):
+        assert np.array_equal(swept.records[name], expected[name]), name
+    assert audit(tmp_path / "run.mcap").resimulation == "bit for bit"
 
 
 def test_every_frozen_run_is_still_run() -> None:
@@ -62,16 +114,23 @@ def test_commands_print_what_was_frozen(name: str, tmp_path: Path) -> None:
     hold(text.splitlines(), found.splitlines())
 
 
-FROZEN = {"tick": "0123456789ab", "work": [1.0], "verdict": "passive", "buttons": "zero"}
-"""Kinds of frozen values: a digest, a number, a word, and a field without a bit."""
+FROZEN = {
+    "kinetic": "0123456789ab",
+    "tick": "0123456789ab",
+    "work": [1.0],
+    "verdict": "passive",
+    "buttons": "zero",
+}
+"""Kinds of frozen values: digests of floats and of counts, a number, a word, and no bit at all."""
 
 
 @pytest.mark.parametrize(
     ("change", "is_of_bits"),
     [
-        ({"tick": "ba9876543210"}, True),
+        ({"kinetic": "ba9876543210"}, True),
         ({"work": [1.0 + 1e-9]}, True),
-        ({"tick": "zero"}, False),
+        ({"kinetic": "zero"}, False),
+        ({"tick": "ba9876543210"}, False),
         ({"work": [1.0 + 1e-5]}, False),
         ({"work": [1.0, 1.0]}, False),
         ({"verdict": "active"}, False),

@@ -229,8 +229,12 @@ def test_a_changed_record_is_not_drawn(sway: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def work(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Puts functions of ``film_work`` in the place of some of the drawing process."""
+    """Puts functions of ``film_work`` in the place of some of the drawing process.
+
+    MuJoCo imports there whatever draws here: it is asked for no renderer.
+    """
     monkeypatch.setenv("PYTHONPATH", str(Path(film_work.__file__).parent))
+    monkeypatch.setattr("hapticbridge.replay.film.RENDERERS", ("disable",))
     monkeypatch.delenv("MUJOCO_GL", raising=False)
 
     def replace(**functions: Callable[..., object]) -> None:

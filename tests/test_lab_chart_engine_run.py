@@ -9,7 +9,7 @@ from itertools import count
 
 import numpy as np
 import pytest
-from engine_tasks import engine_or_skip
+from engine_tasks import HERE
 
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.pose import Vector
@@ -23,7 +23,6 @@ from hapticbridge.lab.chart.setting import OWN, Setting
 from hapticbridge.lab.chart.workload import PeerWork, Workload
 from hapticbridge.lab.engines import mujoco as mujoco_engine
 from hapticbridge.lab.engines.base import (
-    ENGINES,
     Body,
     Engine,
     FreeBody,
@@ -117,9 +116,9 @@ def test_engine_with_a_wrong_mass_or_friction_shows_as_a_worse_point(
     assert score(mistake, name, FINE) > most
 
 
-@pytest.mark.parametrize("name", [name for name in ENGINES if name != "mujoco"])
+@pytest.mark.parametrize("name", [name for name in HERE.available if name != "mujoco"])
 def test_peg_that_leans_and_rod_that_taps_touch_and_rest_in_every_engine(name: str) -> None:
-    engine = engine_or_skip(name)
+    engine = HERE.available[name]
     work = workload("peg_in_hole").peer_work()
     run = EngineRun(engine, work, Setting(METHODS["explicit"], FINE))
     settled = run.scores()["settled"]

@@ -5,25 +5,19 @@ from __future__ import annotations
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from random_hands import random_hand
 
-from hapticbridge.audit import audit
-from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import conditions_of, default_coupling, is_certified
-from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.loop_setting import LoopSetting
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.errors import DeviceError, StudyError
-from hapticbridge.kernel.record import CLOCK_FIELDS, TICK_DTYPE
 from hapticbridge.lab.closed_loop import PARTS, ClosedLoop, LoopOutcome, Timing
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.run.bridge import Bridge
 from hapticbridge.scene import load_scene
 
 T = 1e-3
@@ -35,49 +29,6 @@ STILL = Motion([0.0, 1.0], np.zeros((2, 3)))
 @pytest.fixture(scope="module")
 def point_mass() -> ClosedLoop:
     return ClosedLoop(load_scene("point_mass"))
-
-
-@pytest.mark.parametrize(
-    ("scene", "method"),
-    [("point_mass", "explicit"), ("peg_in_hole", "lossless"), ("peg_in_hole", "implicit")],
-)
-def test_sweep_live_loop_and_audit_agree_to_the_bit(
-    scene: str, method: str, tmp_path: Path
-) -> None:
-    path = f"models/{scene}/{scene}.csv"
-
-    def device() -> SimulatedDevice:
-        return SimulatedDevice(
-            damping=3.0,
-            resolution=1e-6,
-            friction=0.02,
-            delay=1,
-            path=path,
-            force_limit=1e9,
-            torque_limit=1e9,
-        )
-
-    outcome = ClosedLoop(load_scene(scene)).run(
-        device(), COUPLING, METHODS[method], period=T, ticks=1500, keep_records=True
-    )
-    limits = Limits(force=1e9, torque=1e9, ramp=0.0)
-    with Bridge(
-        load_scene(scene),
-        device(),
-        COUPLING,
-        clock=SimulatedClock(),
-        method=method,
-        limits=limits,
-        controller="off",  # the study looks at methods without one
-        recording=tmp_path / "run.mcap",
-    ) as bridge:
-        summary = bridge.run(duration=1.5)
-        expected = bridge.latest_records(1500)
-    assert len(outcome.records) == len(expected) == 1500
-    assert (outcome.environment, outcome.fault) == (summary.environment, summary.fault)
-    for name in set(TICK_DTYPE.names or ()) - set(CLOCK_FIELDS):
-        assert np.array_equal(outcome.records[name], expected[name]), name
-    assert audit(tmp_path / "run.mcap").resimulation == "bit for bit"
 
 
 def test_runs_in_threads_are_the_run_alone() -> None:

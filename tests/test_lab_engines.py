@@ -1,4 +1,4 @@
-"""Every engine against what is known in closed form; one that is not installed is skipped."""
+"""Every installed engine against what is known in closed form; the others are skipped by name."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from engine_tasks import (
     EDGE,
     FLOOR,
     GRAVITY,
+    HERE,
     MASS,
     RESTING,
     driven_error,
     driven_mass,
     driven_path,
-    engine_or_skip,
     opened,
 )
 from scipy.spatial.transform import Rotation
@@ -51,9 +51,16 @@ SPRINGS = {"ode_spring", "physx_spring"}
 """Engines whose coupling is a spring of their own, solved with the contacts."""
 
 
-@pytest.fixture(params=ENGINES)
+@pytest.fixture(params=HERE.available)
 def engine(request: pytest.FixtureRequest) -> Engine:
-    return engine_or_skip(request.param)
+    return HERE.available[request.param]
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_engine_is_installed_under_its_name(name: str) -> None:
+    if name in HERE.missing:
+        pytest.skip(HERE.missing[name])
+    assert HERE.available[name].name == name
 
 
 def turn(quaternion: tuple[float, ...]) -> Rotation:
@@ -96,9 +103,9 @@ def test_a_driven_mass_follows_its_scheme_and_the_closed_form(engine: Engine) ->
     assert coarse / fine == pytest.approx(2, rel=0.25 if engine.name in SPRINGS else 0.1)
 
 
-@pytest.mark.parametrize("name", sorted(SPRINGS))
+@pytest.mark.parametrize("name", sorted(SPRINGS & HERE.available.keys()))
 def test_a_spring_of_the_engines_own_turns_the_tool_as_the_implicit_scheme(name: str) -> None:
-    engine, moment = engine_or_skip(name), 1e-3
+    engine, moment = HERE.available[name], 1e-3
     coupling = replace(COUPLING, rotational_damping=0.05)
     times = np.arange(201) * 1e-3
     angles = 0.2 * np.sin(4 * np.pi * times)
@@ -345,8 +352,9 @@ def test_contacts_count_what_touches() -> None:
     assert Contacts.from_depths([-1e-3, 0.0, 2e-6]) == (2, 2e-6)
 
 
-def test_drake_says_nan_where_it_refuses_to_go_on() -> None:
-    engine = engine_or_skip("drake_point")
+@pytest.mark.parametrize("name", {"drake_point"} & HERE.available.keys())
+def test_drake_says_nan_where_it_refuses_to_go_on(name: str) -> None:
+    engine = HERE.available[name]
     with opened(engine, Task("free", Body(1.0, (1.0,) * 3)), 1e-3) as simulation:
         simulation.advance((float("inf"), 0.0, 0.0), NOTHING)
         simulation.advance(NOTHING, NOTHING)

@@ -199,9 +199,9 @@ def stop_at_start(name: str, seconds: float, folder: Path) -> StopOutcome:
     finally:
         process.kill()
         process.wait(PATIENCE)
-    while any(map(_is_alive, started)) and time.monotonic() < limit:
+    while any(map(is_alive, started)) and time.monotonic() < limit:
         time.sleep(1e-3)
-    orphans = [child for child in started if _is_alive(child)]
+    orphans = [child for child in started if is_alive(child)]
     return StopOutcome(process.returncode, says.splitlines()[-1], path.exists(), orphans)
 
 
@@ -218,6 +218,7 @@ def children(pid: int) -> list[int]:
     return [int(child) for task in tasks for child in task.read_text().split()]
 
 
-def _is_alive(pid: int) -> bool:
+def is_alive(pid: int) -> bool:
+    """Returns whether a process runs: one that has ended and is not waited for does not."""
     status = Path(f"/proc/{pid}/stat")
     return status.exists() and status.read_text().rsplit(")")[-1].split()[0] != "Z"

@@ -75,7 +75,8 @@ class RapierSimulation(HeldSimulation):
 
     def __init__(self, task: base.Task, timestep: float) -> None:
         super().__init__(task, timestep)
-        self._world = world = rapier3d.PhysicsWorld(gravity=task.gravity)
+        world: Any = rapier3d.PhysicsWorld(gravity=task.gravity)
+        self._world = world
         options = world.integration_parameters
         options.dt = self._timestep
         options.length_unit = LENGTH
