@@ -39,6 +39,7 @@ from hapticbridge.errors import CommandError
 from hapticbridge.kernel.record import CLOCK_FIELDS
 from hapticbridge.recording import Recording
 from hapticbridge.run.commands import Command, Couple, Reset, Switch
+from hapticbridge.run.programs import prepare_run
 
 GOLDEN = Path(__file__).parent / "golden"
 RUNS, AUDITS, MACHINE = (GOLDEN / f"{name}.json" for name in ("runs", "audits", "machine"))
@@ -662,6 +663,7 @@ def session_text(name: str, folder: Path) -> str:
     """
     lines = session_file(name).read_text(encoding="utf-8").splitlines()
     commands = [line.removeprefix(_PROMPT) for line in lines if line.startswith(_PROMPT)]
+    prepare_run(lambda _: None)  # so that no command tells of it
     plain = {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
     plain |= dict.fromkeys((force_dimension.FILES.variable, servo.FILES.variable), "/no/such.so")
     shown = []

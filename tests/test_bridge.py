@@ -199,11 +199,7 @@ def test_summary_has_the_peaks_and_energies_of_the_records(motion: str) -> None:
 
 def test_limits_beyond_the_devices_own_are_refused_unless_nobody_feels_them(motion: str) -> None:
     for limits in (Limits(force=11, torque=0.5), Limits(force=10, torque=0.6)):
-<<<<<<< HEAD
-        with pytest.raises(DeviceError, match=r"limit is .*; device 'simulated' allows"):
-=======
         with pytest.raises(DeviceError, match=r"limit is .*; device 'simulated' allows at most"):
->>>>>>> b58d866ec2106643c8cd136dec38a90dcb0f9eca
             fast(limits=limits)
         fast(device=motion, limits=limits)
 
