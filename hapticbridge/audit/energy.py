@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,13 +163,13 @@ class EnergyBalance:
             (n,) in J. Zero for an unknown damping or several laws per tick. With a coupling law,
             energy created by the environment is not included; it belongs to the other port.
         net_energy: Energy given to the hand beyond what the device's damping burned, less what the
-            scene's storage had lost since the start before the tick, (n,) in J; zero without a
+            scene's storage had given before the tick (``released``), (n,) in J; zero without a
             hand. It is what the guard's energy limit bounds, with the damping that the guard takes.
         unpaid_energy: Energy given to the hand beyond what may have paid for it before the tick,
             (n,) in J (``hand_energy.HandEnergy``); zero without a hand.
         springs: Energy at the hand that the coupling's springs held at the start and after each
             reset, in J.
-        scene_loss: Energy in J that the scene's storage has lost after the last of these ticks.
+        released: Energy in J that the scene's storage has given to the hand after the last tick.
         contact_tank: Energy that may pay for the depenetration of rigid contacts, (n,) in J; zero
             with the contacts of the scene.
         sums: Cumulative energies after the last of these ticks, for ``AuditState``.
@@ -185,7 +185,7 @@ class EnergyBalance:
     net_energy: Array
     unpaid_energy: Array
     springs: float
-    scene_loss: float
+    released: float
     contact_tank: Array
     sums: dict[str, float]
 
@@ -234,7 +234,9 @@ class EnergyBalance:
             in_springs = stored_in_springs(parameters, gains, (motion.stretch, motion.twist))
             in_springs = in_springs - totals["start_springs"]
         excess = _device_excess(parameters, totals, created, in_springs)
-        totals |= {"stored": stored - others_work, "taken": created + coupling_work}
+        totals |= {"created": created, "taken": np.maximum(created, 0.0) + coupling_work}
+        totals["pushes"] = ticks["actuator_work"] + ticks["external_work"]
+        totals |= _released(totals, before, stored - others_work, is_reset)
         ratio = parameters.force_scale / parameters.scale
         net, unpaid = _hand_energies(ratio, totals, before, is_reset)
         # D_k = min(cap, D_{k-1} - E_k) is the lowest cap + Σ E so far, or 0, minus Σ E
@@ -253,7 +255,7 @@ class EnergyBalance:
             net_energy=net * parameters.guarding.has_hand,
             unpaid_energy=unpaid * parameters.guarding.has_hand,
             springs=float(ratio * totals["start_springs"][-1]),
-            scene_loss=max(-float(stored[-1]), 0.0),
+            released=float(totals["released"][-1]),
             contact_tank=(ceiling - created) * (parameters.is_rigid and not parameters.scene_ticks),
             sums={name: float(total[-1]) for name, total in totals.items()},
         )
@@ -285,14 +287,41 @@ def _hand_energies(
     a reset has put back in stays lost.
     """
     stored, taken = (
-        np.concatenate([[before[name]], totals[name][:-1]]) for name in ("stored", "taken")
+        np.concatenate([[before[name]], totals[name][:-1]]) for name in ("released", "taken")
     )
-    lost = np.minimum(stored, 0.0)
-    totals["forgotten"] = _summed(np.where(is_reset, lost, 0.0), before["forgotten"])
-    lost = np.where(is_reset, 0.0, lost) + totals["forgotten"]
-    net = totals["hand_energy"] + ratio * lost
+    totals["forgotten"] = _summed(np.where(is_reset, stored, 0.0), before["forgotten"])
+    net = totals["hand_energy"] - ratio * (np.where(is_reset, 0.0, stored) + totals["forgotten"])
     released = np.maximum(totals["start_springs"] - taken, 0.0)
     return net, totals["hand_energy"] - totals["unfelt_work"] - ratio * released
+
+
+def _released(
+    totals: dict[str, Array], before: dict[str, float], stored: Array, is_reset: NDArray[np.bool_]
+) -> dict[str, Array]:
+    """Returns R of ``passivity_controller.released_energy`` after each tick, m and W_c at a reset.
+
+    Args:
+        totals: W_c ``coupling_work``, Σ E ``created`` and W_p ``pushes`` after each tick, in J.
+        before: The same before the first of these ticks, with m and W_c at the last reset.
+        stored: S − S_0 without the work of other hands, (n,) in J.
+        is_reset: True for a tick that begins with a reset, whose own work m leaves out.
+    """
+    names = "coupling_work", "created", "pushes"
+    work, created, pushes = (np.concatenate([[before[name]], totals[name]]) for name in names)
+    steps = np.where(is_reset, 0.0, np.diff(pushes) + np.minimum(np.diff(created), 0.0))
+    pushed, at_reset = np.empty(len(steps)), np.empty(len(steps))
+    last, base = before["pushed"], before["work_at_reset"]
+    edges = np.unique([0, *np.flatnonzero(is_reset), len(steps)])
+    for first, end in pairwise(edges):
+        if is_reset[first]:
+            last, base = 0.0, work[first]
+        sums = np.cumsum(np.concatenate([[last], steps[first:end]]))
+        # m = max(m + δ, 0) is the sum above its lowest value, or above 0
+        pushed[first:end] = (sums - np.minimum(np.minimum.accumulate(sums), 0.0))[1:]
+        last, at_reset[first:end] = pushed[end - 1], base
+    given = at_reset - work[1:] - pushed
+    released = np.maximum(np.minimum(given, -stored), 0.0)
+    return {"released": released, "pushed": pushed, "work_at_reset": at_reset}
 
 
 def _summed(values: Array, before: float) -> Array:

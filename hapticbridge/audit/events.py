@@ -227,7 +227,11 @@ SUMS = (
     "discarded",
     "start_springs",
     "hand_energy",
-    "stored",
+    "created",
+    "pushes",
+    "pushed",
+    "work_at_reset",
+    "released",
     "taken",
     "forgotten",
 )

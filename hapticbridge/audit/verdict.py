@@ -296,7 +296,7 @@ class PassivityTally:
             net=max(self.hand_energy.net, float(np.max(balance.net_energy))),
             unpaid=max(self.hand_energy.unpaid, float(np.max(balance.unpaid_energy))),
             springs=balance.springs,
-            scene=balance.scene_loss,
+            scene=balance.released,
             motors=float(last["actuator_work"]),
             inputs=float(last["external_work"]),
         )

@@ -19,23 +19,24 @@ class HandEnergy:
     With E the work of the wrench on the device less what the device's damping burned, every hand
     behind a coupling law and a device that bears it gets
 
-        E <= q (S_0 − S + V_0 + W_m + W_i) + W_u
+        E <= q (V_0 − W_c) + W_u
 
-    S is the scene's storage and S_0 that at the start, V_0 the energy of the coupling's springs at
-    the start and after each reset. W_m, W_i are the works of the scene's motors and inputs, other
-    hands included, W_u that of axes without a motor; q = force_scale / scale. What E exceeds the
-    right-hand side by is unpaid, but no more than E: what was created and stays in the scene is not
-    at the hand.
+    W_c is the coupling's work on the scene, V_0 the energy of the coupling's springs at the start
+    and after each reset, W_u the work of axes without a motor; q = force_scale / scale. What the
+    scene gave through the coupling, −W_c, came from its storage, its motors, its inputs (other
+    hands included), or from nowhere: Σ E_k. What E exceeds the right-hand side by without the
+    latter is unpaid, but no more than E.
 
     Up to ``INSTANT`` may be unpaid in a certified run, because late samples may give that much.
     Nothing else needs an allowance. The inequality holds for the positions that were read, of which
     the law made the forces: encoder steps and delays within the device cannot exceed it.
 
     Attributes:
-        net: Largest E + q min(S − S_0, 0) in J; the guard's energy limit bounds it.
+        net: Largest E − q R in J with R of ``passivity_controller.released_energy``; the guard's
+            energy limit bounds it.
         unpaid: Largest unpaid energy in J.
         springs: q V_0 in J.
-        scene: Energy in J that the scene's storage has lost since the start.
+        scene: R, energy in J that the scene's storage has given to the hand.
         motors: W_m in J of the scene; negative if motors took back more than they gave.
         inputs: W_i in J of the scene: applied forces, moved mocap bodies, gravity compensation.
 

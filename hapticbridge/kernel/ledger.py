@@ -18,12 +18,12 @@ The accounts of energy, all in J; q = force_scale / scale:
 | device without a law          | Σ w·δp − b ‖δp‖²/t + q (S − S_0 − W)   | verdict         |
 | observer, ``observed_energy`` | as above less W_u, with credit capped  | ``damper``      |
 | observer, ``created_energy``  | Σ E_k − slack, with its credit capped  | ``environment`` |
-| observer, ``guarded_energy``  | Σ w·δp − b ‖δp‖²/t + q min(S − S_0, 0) | energy limit    |
+| observer, ``guarded_energy``  | Σ w·δp − b ‖δp‖²/t − q R               | energy limit    |
 | audit, device port            | ``audit.energy.stored_in_springs``     | its verdict     |
 
 ``damper`` and ``environment`` are the passivity controllers. w is the wrench on the device, δp
 its motion, b its damping, t the time between two new samples, W the work of the scene's actuators
-and of external forces, W_u ``passivity_controller.unfelt_work``.
+and of external forces. W_u is ``passivity_controller.unfelt_work``, R its ``released_energy``.
 """
 
 from __future__ import annotations

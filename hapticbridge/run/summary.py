@@ -28,8 +28,10 @@ from hapticbridge.demand.trip import Trip
 from hapticbridge.device import DeviceInfo
 from hapticbridge.kernel.codes import Grip, Scheme, coupling_ids, held_body
 from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
+from hapticbridge.kernel.jit import source_of
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.passivity_controller import released_energy
 from hapticbridge.kernel.record import TickFlag
 from hapticbridge.units import energy_rows, format_share, format_si, format_wrenches
 
@@ -506,13 +508,14 @@ def _fault(
 def _hand_energy(state: NDArray[np.void], parameters: RunParameters) -> HandEnergy:
     """Reads the energy of a hand from the kernel's state."""
     observer, energy = state["observer"][0], state["energy"][0]
-    loss = energy["start_energy"] - energy["kinetic"] - energy["potential"]
     ratio = parameters.force_scale / parameters.scale
     return HandEnergy(
         net=float(observer["max_guarded_energy"]),
         unpaid=float(observer["max_unpaid_energy"]),
         springs=ratio * float(observer["springs"]),
-        scene=max(float(loss), 0.0),
+        scene=source_of(released_energy)(
+            observer, energy, float(energy["kinetic"] + energy["potential"])
+        ),
         motors=float(energy["actuator_work"]),
         inputs=float(energy["external_work"]),
     )
