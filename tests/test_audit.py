@@ -57,7 +57,7 @@ def test_balance_agrees_with_the_kernel_and_with_a_sum_by_hand(held: Recording) 
     off = {deviation.field: deviation.amount.max() for deviation in found}
     assert off["wrench_on_tool"] < 1e-11
     assert off["wrench_on_device"] < 1e-13
-    assert off["share"] < 1e-15
+    assert off["lever"] < 1e-15
     assert off["handle_position"] < 1e-16
     assert off["handle_quaternion"] < 1e-15
     created, slack = energy_by_hand(held)

@@ -216,7 +216,7 @@ def test_second_run_raises_the_force_from_zero_again_and_is_simulated_again(tmp_
         bridge.run(0.6)
     rows = read_recording(path).ticks
     rise = np.minimum(np.arange(1, 601) / 101, 1.0)
-    np.testing.assert_allclose(rows["share"], [*rise, *rise], atol=1e-12)
+    np.testing.assert_allclose(rows["lever"], [*rise, *rise], atol=1e-12)
     before, first = np.linalg.norm(rows["wrench_on_tool"][[599, 600]], axis=1)
     assert first == pytest.approx(before, rel=0.1)
     report = audit(path)

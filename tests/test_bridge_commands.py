@@ -315,7 +315,7 @@ def test_a_hand_that_lets_go_by_command_moves_no_handle_and_feels_nothing(
     assert not ticks["wrench_on_device"][621:800].any()
     assert np.ptp(ticks["handle_position"][650:800], axis=0).max() < 1e-4
     assert np.ptp(ticks["device_position"][600:800], axis=0).max() > 5e-3
-    assert (ticks["share"][821:] == 1.0).all()
+    assert (ticks["lever"][821:] == 1.0).all()
     assert audit(path).verdict == "passive"
 
 

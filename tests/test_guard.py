@@ -65,7 +65,7 @@ def lever_error(ticks: NDArray[np.void]) -> float:
     """Returns the largest difference in J between the work at the device and at the handle."""
     device, handle = (np.diff(ticks[f"{end}_position"], axis=0) for end in ("device", "handle"))
     sent, felt = ticks["wrench_on_device"][:-1, :3], ticks["wrench_on_tool"][:-1, :3]
-    has_slipped = ticks["share"][1:] == 0.0  # the hand is away, and the coupling relaxes
+    has_slipped = ticks["lever"][1:] == 0.0  # the hand is away, and the coupling relaxes
     work = np.sum(sent * device + felt * handle, axis=1)
     return float(np.abs(np.cumsum(np.where(has_slipped, 0.0, work))).max())
 
@@ -83,7 +83,7 @@ def test_a_clutch_moves_the_device_without_the_handle_and_comes_back_within_the_
     assert not outcome.forces[away].any()
     assert outcome.forces[UP] < 0.01 * LIMIT
     assert np.abs(np.diff(outcome.forces[DOWN - 1 : UP + 400])).max() < 0.1 * LIMIT
-    assert (ticks["share"][UP + 20 :] == 1.0).all()
+    assert (ticks["lever"][UP + 20 :] == 1.0).all()
     assert np.flatnonzero(ticks["flags"] & CLUTCH).tolist() == list(range(DOWN, UP))
     assert lever_error(ticks) < 1e-12
     assert outcome.energy <= NOTHING
@@ -398,7 +398,7 @@ def test_a_hand_is_given_nothing_while_the_force_rises(tmp_path: Path, pose: Pos
     recording = read_recording(path)
     ticks = recording.ticks
     share = np.minimum(np.arange(1, len(ticks) + 1) / (RAMP + 1), 1.0)
-    np.testing.assert_allclose(ticks["share"], share, atol=1e-12)
+    np.testing.assert_allclose(ticks["lever"], share, atol=1e-12)
     # by itself: work of what was sent until the next sample, less what the damper burns meanwhile
     moved = np.diff(ticks["device_position"], axis=0)
     turn = np.diff(2 * np.arcsin(ticks["device_quaternion"][:, 1]))

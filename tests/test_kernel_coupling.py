@@ -40,7 +40,7 @@ from hapticbridge.kernel.law import (
     is_straight,
     length_at,
     limited,
-    share_of_gains,
+    next_gain_ratio,
     spring_energy,
     spring_length,
 )
@@ -224,7 +224,7 @@ def test_a_spring_is_bent_where_its_force_is_not_that_of_the_linear_law() -> Non
 @pytest.mark.parametrize("answer", [0.5, 3.0, 4.0, 60.0])
 def test_a_share_of_the_gains_gives_the_springs_force(answer: float, compliance: float) -> None:
     last = 0.7  # any share that was tried before
-    share = share_of_gains(SPRING, last * answer / (1 + last * compliance), last, compliance)
+    share = next_gain_ratio(SPRING, last * answer / (1 + last * compliance), last, compliance)
     u = answer / (1 + share * compliance)
     assert share * u == pytest.approx(_force(u / SPRING.stiffness))
 

@@ -114,7 +114,7 @@ def test_a_probe_lowers_the_force_for_a_moment_and_is_no_alarm(tmp_path: Path) -
     is_probed = (ticks["flags"] & int(TickFlag.PROBED)) != 0
     begins = 1 + np.flatnonzero(np.diff(is_probed.astype(int)) == 1)
     assert 1 <= len(begins) <= 3
-    share = ticks["share"]
+    share = ticks["lever"]
     assert share[is_probed].min() == 0.25
     assert (share[begins - 1] == 1.0).all()
     assert (share[begins + 200] == 1.0).all()  # 0.15 s and two fades
@@ -134,7 +134,7 @@ def test_a_reversed_motor_that_holds_the_handle_on_its_stop_is_said_to_be_unknow
     assert "move the handle away from its stop" in str(summary)
     ticks = hb.read_recording(path).ticks
     assert np.abs(ticks["wrench_on_device"][:, 0]).max() > 4.0
-    assert (ticks["share"][1500:] == 0.25).all()  # the force does not come back
+    assert (ticks["lever"][1500:] == 0.25).all()  # the force does not come back
     report = audit(path)
     assert report.resimulation == "bit for bit"
     assert report.certified is False
@@ -147,9 +147,9 @@ def test_the_force_comes_back_off_the_stop_if_the_motor_is_right(sign: float, pu
     with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock()) as bridge:
         bridge.run(2.3)
         ticks = bridge.latest_records(2300)
-    assert ticks["share"][1790] == 0.25
+    assert ticks["lever"][1790] == 0.25
     assert ticks["device_position"][-1, 0] < 0.009
-    assert ticks["share"][-1] == (1.0 if sign > 0.0 else 0.0)
+    assert ticks["lever"][-1] == (1.0 if sign > 0.0 else 0.0)
 
 
 @pytest.mark.parametrize(("stiffness", "step"), [(5e4, 0.0), (np.inf, 2e-5), (5e4, 2e-5)])
@@ -162,7 +162,7 @@ def test_neither_a_soft_stop_nor_an_unsteady_digit_hides_a_reversed_motor(
     limits = Limits(force=limit, torque=0.5)
     with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock(), limits=limits) as bridge:
         summary = bridge.run(2.5)
-        share = bridge.latest_records(2500)["share"]
+        share = bridge.latest_records(2500)["lever"]
     assert summary.timekeeping.alarm is Alarm.UNANSWERED
     assert (share[2000:] == 0.25).all()
 
@@ -469,8 +469,8 @@ def test_summary_and_audit_say_what_the_watch_did(tmp_path: Path) -> None:
     is_on = (ticks["flags"] & int(TickFlag.SWINGING | TickFlag.RUNS_AWAY)) != 0
     first = int(np.argmax(is_on))
     assert is_on[first:].all()
-    assert (np.diff(ticks["share"][first:]) <= 0.0).all()
-    assert ticks["share"][-1] <= 0.5
+    assert (np.diff(ticks["lever"][first:]) <= 0.0).all()
+    assert ticks["lever"][-1] <= 0.5
 
 
 def test_without_the_watch_nothing_is_said(tmp_path: Path) -> None:

@@ -202,7 +202,7 @@ def test_force_over_the_limit_keeps_its_direction_on_tool_and_device() -> None:
 def test_share_rises_linearly_over_the_ramp_and_the_handle_follows_by_it() -> None:
     ramped = fast(FREE_BALL, samples_of(sines(100, 0.02, 3.0)), ramp_ticks=40).ticks
     share = np.minimum((np.arange(100) + 1) / 41, 1.0)
-    np.testing.assert_allclose(ramped["share"], share, rtol=1e-12)
+    np.testing.assert_allclose(ramped["lever"], share, rtol=1e-12)
     np.testing.assert_allclose(
         ramped["wrench_on_device"], -share[:, None] * ramped["wrench_on_tool"], atol=1e-15
     )

@@ -67,7 +67,7 @@ def test_an_impossible_option_is_refused_when_it_is_made(
         (lambda: Coupling(1.0, 1.0, 1.0, math.nan), "coupling rotational damping is nan"),
         (lambda: Workspace(force_scale=0.0), "force scale is 0.0"),
         (lambda: Limits(force=1.0, torque=1.0, stretch=0.0), "stretch limit is 0.0 m"),
-        (lambda: Limits(force=1.0, torque=1.0, angle=4.0), "angle limit is 4.0 rad"),
+        (lambda: Limits(force=1.0, torque=1.0, angle=4.0), "angle limit is 4 rad"),
         (lambda: GuardParameters(hold_force=0.0), "guard: hold force is 0.0"),
         (lambda: GuardParameters(max_damping=-1.0), "guard: max damping is -1.0"),
         (lambda: GuardParameters(fade_ticks=0), "guard: fade ticks is 0"),

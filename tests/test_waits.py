@@ -59,7 +59,6 @@ REASONS = {
     "exclusively for the time of one removal",
     "recording/container.py: with ThreadPoolExecutor(2)": "compression of a chunk in memory",
     "recording/container.py: record.result()": "compression of a chunk in memory",
-    "view/process.py: for line in stream": DAEMON,
     "view/process.py: stream.readline()": "the bridge's end closes it",
     "view/process.py: time.sleep(due - now)": "until the bridge closes its end, or is dead",
     "view/controls.py: time.sleep(pace)": DAEMON,

@@ -68,7 +68,7 @@ def stored_in_springs(
 
     for every hand and tool if b >= K T/2 + B': the identity behind (6), with V(e) at the end on the
     left. At the start the springs may hold the tool's weight. V is the energy of a spring whose
-    force stops growing at the force level. It holds at any share r, because the handle moves by r
+    force stops growing at the force level. It holds at any lever r, because the handle moves by r
     times the device's motion where the device gets r times the force. An excess above zero is the
     fault of the port ``device``.
 
@@ -344,7 +344,7 @@ def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict
     whole = whole_wrench(rows[: len(ticks)], parameters)
     whole[np.isin(ticks["tick"], events.resumed)] = 0.0
     gains = events.gains(ticks["tick"])
-    unfelt = unfelt_work(parameters, gains, whole, rows["share"][: len(ticks)], (moved, turned))
+    unfelt = unfelt_work(parameters, gains, whole, rows["lever"][: len(ticks)], (moved, turned))
     late = np.sum(sent[:, :3] * late_moved, axis=1) + np.sum(sent[:, 3:] * late_turned, axis=1)
     dissipation = np.zeros(len(ticks))
     if parameters.device_damping is not None:
@@ -373,7 +373,7 @@ def unfelt_work(
     parameters: RunParameters,
     gains: Array,
     whole: Array,
-    share: Array,
+    lever: Array,
     motion: tuple[Array, Array],
 ) -> Array:
     """Returns the work that the hand saves along axes that are sensed without a motor.
@@ -381,7 +381,7 @@ def unfelt_work(
         W_u = −w_u·δp + q r² (K/2 + B'/T) ‖δp_u‖²
 
     w_u is the wrench that a motor would have been sent, δp_u the motion along those axes, r the
-    share, q the ratio of the stiffness at the device to that in the scene. The second part is what
+    lever, q the ratio of the stiffness at the device to that in the scene. The second part is what
     the damping that the coupling needs would burn. Like the work of a scene's own motors, this work
     is a port of its own: the hand may get it back along the other axes.
 
@@ -389,7 +389,7 @@ def unfelt_work(
         parameters: Run parameters.
         gains: K, B', K_r and B'_r, (n, 4).
         whole: Wrench that six motors would have been sent, (n, 6) in N and N m.
-        share: r, (n,).
+        lever: r, (n,).
         motion: δp of each tick, (n, 3) in m, and its rotation vectors, (n, 3) in rad.
 
     Returns:
@@ -403,7 +403,7 @@ def unfelt_work(
         unfelt = step * lacking[first : first + 3]
         burned = 0.5 * gains[:, column] + gains[:, column + 1] / parameters.period
         work -= np.sum(whole[:, first : first + 3] * unfelt, axis=1)
-        work += ratio * share**2 * burned * np.sum(unfelt**2, axis=1)
+        work += ratio * lever**2 * burned * np.sum(unfelt**2, axis=1)
     return work
 
 

@@ -89,9 +89,9 @@ class Motion:
 
     @classmethod
     def from_records(
-        cls, ticks: NDArray[np.void], state: AuditState, events: RunEvents, share: Array
+        cls, ticks: NDArray[np.void], state: AuditState, events: RunEvents, lever: Array
     ) -> Motion:
-        """Computes the motion of consecutive records; ``share`` is r_{k−1}, (n,)."""
+        """Computes the motion of consecutive records; ``lever`` is r_{k−1}, (n,)."""
         rows = np.concatenate([state.row, ticks])
         is_reset = events.is_reset(ticks["tick"])[:, None]
         handle, tool = pose_of(rows, "handle"), pose_of(rows, "tool")
@@ -103,10 +103,10 @@ class Motion:
         moved = parameters.scale * np.diff(device[:, :3], axis=0) @ axes.T
         # a rotation vector turns with the axes: log(A R Aᵀ) = A log(R)
         turned = turn_between(device[:-1, 3:], device[1:, 3:]) @ axes.T
-        handle_turn = share[:, None] * turned
+        handle_turn = lever[:, None] * turned
         turned_back = quaternion_product(quaternion_of(-handle_turn), handle[:, 3:])
         return cls(
-            handle_step=share[:, None] * moved,
+            handle_step=lever[:, None] * moved,
             handle_turn=handle_turn,
             tool_step=tool[:, :3] - tool_before[:, :3],
             tool_turn=turn_between(tool_before[:, 3:], tool[:, 3:]),

@@ -211,12 +211,12 @@ def is_clutched(ticks: NDArray[np.void], parameters: RunParameters) -> Flags:
 
 
 def is_let_go(ticks: NDArray[np.void], parameters: RunParameters) -> Flags:
-    """Returns True for each record whose share falls by a button, a command or the reach."""
+    """Returns True for each record whose lever falls by a button, a command or the reach."""
     return np.asarray(is_clutched(ticks, parameters) | ((ticks["buttons"] & FORCE_OFF) != 0))
 
 
 def may_fade(ticks: NDArray[np.void]) -> Flags:
-    """Returns True for each record whose share may fall, also after several old samples."""
+    """Returns True for each record whose lever may fall, also after several old samples."""
     is_off = (ticks["buttons"] & FORCE_OFF) != 0
     return np.asarray(is_off | has_flag(ticks, TickFlag.CLUTCH | TickFlag.STALE_SAMPLE))
 
@@ -229,7 +229,7 @@ def _flag_faults(
     guarding = parameters.guarding
     none, every = np.zeros(len(ticks), bool), np.ones(len(ticks), bool)
     is_released, is_touching = is_clutched(ticks, parameters), ticks["contacts"] > 0
-    is_partial = ticks["share"] < 1
+    is_partial = ticks["lever"] < 1
     controls = guarding.controller == DAMPER
     controls |= guarding.controller == ENVIRONMENT and parameters.has_law
     for flag, is_due, is_possible in (

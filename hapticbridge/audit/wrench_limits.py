@@ -1,10 +1,10 @@
-"""Second computation of the handle, the share and the limited wrench of each tick.
+"""Second computation of the handle, the lever and the limited wrench of each tick.
 
 Each tick follows from its record and the previous one:
 
     h_k = h_{k−1} + r_{k−1} scale A δp_k,    w_k = −r_k s Aᵀ f_k,    f_k = P_F(u_k)
 
-r is the recorded share, δp the device's motion, A the device's axes, f the wrench on the tool, u
+r is the recorded lever, δp the device's motion, A the device's axes, f the wrench on the tool, u
 the coupling's law at the recorded poses, F the force level, w the wrench on the device and s
 ``force_scale`` (divided by ``scale`` for torque). Where the record says so, the handle slipped
 toward the tool, and its spring must not have gained. While the passivity controller acts, only the
@@ -50,7 +50,7 @@ class AuditedBlock:
         is_first: True for the first tick after a start or a pause without force, (n,).
         interval: Time in s since the device's last new sample, at least T between readings, (n,).
         sample_ticks: Ticks since the device's last new sample, at least 1, (n,).
-        share_before: r_{k−1}, the share of the device's motion that the handle made, (n,).
+        lever_before: r_{k−1}, the part of the device's motion that the handle made, (n,).
         rise_ticks: Ticks in which r rises from 0 to 1, (n,).
         scene_ticks: Ticks between two results of a slower scene; 0 for another.
     """
@@ -62,7 +62,7 @@ class AuditedBlock:
     is_first: Flags
     interval: Array
     sample_ticks: NDArray[np.int64]
-    share_before: Array
+    lever_before: Array
     rise_ticks: Array
     scene_ticks: int
 
@@ -77,11 +77,11 @@ class AuditedBlock:
         """Evaluates consecutive records, at least one."""
         parameters = events.parameters
         is_first, is_reset = events.is_first(ticks), events.is_reset(ticks["tick"])
-        before = np.concatenate([state.row["share"], ticks["share"][:-1]])
-        before[is_first] = first_share(parameters)
+        before = np.concatenate([state.row["lever"], ticks["lever"][:-1]])
+        before[is_first] = first_lever(parameters)
         before[is_reset] = 0.0
         # a start rises slowly; after a reset, or once r has been 0, it rises within the fade
-        is_short = is_reset | ((ticks["share"] == 0.0) & may_fade(ticks))
+        is_short = is_reset | ((ticks["lever"] == 0.0) & may_fade(ticks))
         start, fade = newest(is_first), newest(is_short)
         rise = np.where(fade >= start, parameters.guarding.fade_ticks, parameters.ramp_ticks)
         rise = np.where((start < 0) & (fade < 0), state.rise_ticks, rise)
@@ -93,7 +93,7 @@ class AuditedBlock:
             is_first=is_first,
             interval=_sample_intervals(ticks, state, parameters.period),
             sample_ticks=_sample_ticks(ticks, state),
-            share_before=before,
+            lever_before=before,
             rise_ticks=rise,
             scene_ticks=parameters.scene_ticks,
         )
@@ -111,7 +111,7 @@ class AuditedBlock:
         )
 
 
-def first_share(parameters: RunParameters) -> float:
+def first_lever(parameters: RunParameters) -> float:
     """Returns r before the first tick and after a pause."""
     return 0.0 if parameters.guarding.has_hand or parameters.ramp_ticks > 0 else 1.0
 
@@ -139,7 +139,7 @@ def _sample_intervals(ticks: NDArray[np.void], state: AuditState, period: float)
 
 
 def wrench_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviation]:
-    """Yields the deviations of handle, wrench on the tool, share, wrench and injected damping."""
+    """Yields the deviations of handle, wrench on the tool, lever, wrench and injected damping."""
     ticks, parameters = block.ticks, events.parameters
     yield from _handle_deviations(block, events)
     if parameters.has_law and parameters.law_evaluations == 1:
@@ -150,10 +150,10 @@ def wrench_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviat
         yield Deviation.between(
             "wrench_on_tool", ticks["wrench_on_tool"], law, "N or N m", "coupling law and poses"
         )
-    share, before, fade = ticks["share"], block.share_before, parameters.guarding.fade_ticks
+    lever, before, fade = ticks["lever"], block.lever_before, parameters.guarding.fade_ticks
     highest = np.minimum(before + 1 / (block.rise_ticks + 1), 1.0)
     lowest = np.maximum(before - 1 / fade, 0.0)
-    risen, fallen = np.abs(share - highest), np.abs(share - lowest)
+    risen, fallen = np.abs(lever - highest), np.abs(lever - lowest)
     off = np.where(is_let_go(ticks, parameters), fallen, risen)
     off = np.where(has_flag(ticks, TickFlag.STALE_SAMPLE), np.minimum(fallen, risen), off)
     # the watch's cap lies between the two, and the re-simulation checks it
@@ -161,8 +161,8 @@ def wrench_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviat
     is_probed = has_flag(ticks, TickFlag.PROBED)
     highest = np.where(is_probed, np.minimum(before + 1 / fade, 1.0), highest)
     lowest = np.where(has_flag(ticks, TickFlag.RUNS_AWAY), 0.0, lowest)
-    off = np.where(is_capped, np.maximum(np.maximum(share - highest, lowest - share), 0.0), off)
-    yield Deviation("share", off, TOLERANCE, "", "buttons, events and flags")
+    off = np.where(is_capped, np.maximum(np.maximum(lever - highest, lowest - lever), 0.0), off)
+    yield Deviation("lever", off, TOLERANCE, "", "buttons, events and flags")
     yield _wrench_deviation(block, parameters)
     is_active = has_flag(ticks, TickFlag.CONTROLLER_ACTIVE)
     guarding = parameters.guarding
@@ -201,7 +201,7 @@ def _handle_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Devia
             for k, e in zip((before, gains), lengths, strict=True)
         )
         gained = np.where(has_slipped & (amount > TOLERANCE), kept - stored, amount)
-        yield Deviation(name, gained, TOLERANCE * (1 + stored), unit, "device pose and share")
+        yield Deviation(name, gained, TOLERANCE * (1 + stored), unit, "device pose and lever")
 
 
 def axes_with_motor(parameters: RunParameters) -> Array:
@@ -216,19 +216,19 @@ def whole_wrench(ticks: NDArray[np.void], parameters: RunParameters) -> Array:
     if not parameters.has_law:  # a law limits it on the tool too
         for part, limit in zip((_FORCE, _TORQUE), limits_on_tool(parameters), strict=True):
             on_tool[:, part] = shortened(on_tool[:, part], limit)
-    wrench = -parameters.force_scale * ticks["share"][:, None] * on_tool
+    wrench = -parameters.force_scale * ticks["lever"][:, None] * on_tool
     return np.concatenate(
         [wrench[:, _FORCE] @ axes, wrench[:, _TORQUE] / parameters.scale @ axes], axis=1
     )
 
 
 def _wrench_deviation(block: AuditedBlock, parameters: RunParameters) -> Deviation:
-    """Compares the wrench on the device with the share of the wrench on the tool."""
+    """Compares the wrench on the device with the wrench on the tool times the lever."""
     ticks = block.ticks
     expected = whole_wrench(ticks, parameters) * axes_with_motor(parameters)
     sent = ticks["wrench_on_device"]
     deviation = Deviation.between(
-        "wrench_on_device", sent, expected, "N or N m", "wrench on the tool and share"
+        "wrench_on_device", sent, expected, "N or N m", "wrench on the tool and lever"
     )
     limits = parameters.force_limit, parameters.torque_limit
     beyond = [

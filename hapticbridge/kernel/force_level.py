@@ -10,12 +10,12 @@ a monotone damper. Its slopes are at most K and B', so the device condition b >=
 it is. A limit on the device alone breaks the guarantee: a hand that stretches the coupling far
 beyond the limit and then yields receives energy that it never supplied.
 
-MuJoCo solves the coupling implicitly, with the gains c K and c B'. The share c = F/‖u‖ depends on
+MuJoCo solves the coupling implicitly, with the gains c K and c B'. The ratio c = F/‖u‖ depends on
 u at the end of the step, which is not known before. So the step is repeated with other gains until
 they fit. Positions, contacts and velocities at its start stay valid; only the forces are solved
 again. Within a step
 u answers to the force nearly as ‖u‖ = A/(1 + c σ); σ is learnt from the last two solutions, and c
-for the next tick is extrapolated, so most saturated ticks need one repetition. The share is 1 and
+for the next tick is extrapolated, so most saturated ticks need one repetition. The ratio is 1 and
 nothing is repeated while the coupling is below its level.
 """
 
@@ -39,8 +39,8 @@ from hapticbridge.kernel.law import (
     is_bent,
     law_wrench,
     limited,
+    next_gain_ratio,
     set_gains,
-    share_of_gains,
     springs,
 )
 from hapticbridge.kernel.ledger import has_loaded_body, meter_ports_again
@@ -58,7 +58,7 @@ REPETITIONS = 12
 LEVEL_DTYPE = np.dtype(
     [
         ("level", "<f8", 2),
-        ("share", "<f8", 2),
+        ("gain_ratio", "<f8", 2),
         ("previous", "<f8", 2),
         ("compliance", "<f8", 2),
         ("tried", "<f8", 2),
@@ -73,7 +73,7 @@ LEVEL_DTYPE = np.dtype(
     ]
 )
 """Sub-record ``level``, written by this module alone. Pairs are force and torque: ``level`` F on
-the tool in N and N m, ``share`` c of the present gains, ``previous`` c of the previous tick,
+the tool in N and N m, ``gain_ratio`` c of the present gains, ``previous`` c of the previous tick,
 ``compliance`` σ; ``tried`` c of the previous repetition in the step and ``length`` its ‖u‖;
 ``wanted`` c of the next repetition and ``found`` the present ‖u‖.
 ``is_solved`` is 1 if steps are repeated, and ``reads_poses`` if sensors, plugins or a callback read
@@ -93,7 +93,7 @@ def bind_level(
         is_solved: True if the wrench is solved inside MuJoCo's step.
     """
     level["level"] = levels
-    level["share"] = level["previous"] = 1.0
+    level["gain_ratio"] = level["previous"] = 1.0
     level["is_solved"] = is_solved
     level["reads_poses"] = (
         model.nsensor > 0 or model.nplugin > 0 or mujoco.get_mjcb_control() is not None
@@ -174,14 +174,14 @@ def _is_at_level(s: State, count: int) -> bool:
     sizes, both = (norm(force), norm(torque)), springs(s)
     is_done = True
     for ch in range(2):
-        c, size = level.share[ch], sizes[ch]
+        c, size = level.gain_ratio[ch], sizes[ch]
         u = level.found[ch] = size / c
         if count > 0 and c != level.tried[ch]:
             u_last = level.length[ch]
             change = level.tried[ch] * u_last - size
             if abs(change) > 1e-12 * level.level[ch]:
                 level.compliance[ch] = max((u - u_last) / change, 0.0)
-        new = share_of_gains(both[ch], size, c, level.compliance[ch])
+        new = next_gain_ratio(both[ch], size, c, level.compliance[ch])
         if count > REPETITIONS // 2:
             new = 0.5 * (c + new)
         if abs(new - c) * u > TOLERANCE * level.level[ch]:
@@ -202,7 +202,7 @@ def _try_shares(s: State) -> None:
     level = s.level
     for ch in range(2):
         level.length[ch] = level.found[ch]
-        level.tried[ch], level.share[ch] = level.share[ch], level.wanted[ch]
+        level.tried[ch], level.gain_ratio[ch] = level.gain_ratio[ch], level.wanted[ch]
     set_gains(s, 1.0)
 
 
@@ -250,12 +250,12 @@ def _foresee_shares(s: State) -> None:
     level = s.level
     is_changed = False
     for ch in range(2):
-        c = level.share[ch]
+        c = level.gain_ratio[ch]
         reach = 2.0 / c - 1.0 / level.previous[ch]
         level.previous[ch] = c
         new = 1.0 / reach if c < 1.0 and reach > 1.0 else 1.0
         is_changed = is_changed or new != c
-        level.share[ch] = new
+        level.gain_ratio[ch] = new
     if is_changed:
         set_gains(s, 1.0)
 
@@ -300,7 +300,7 @@ def limited_wrench_after_step(
     s = states[0]
     is_reduced = False
     for i in range(states.size):
-        share = states[i].level.share
+        share = states[i].level.gain_ratio
         is_reduced = is_reduced or share[0] < 1.0 or share[1] < 1.0
     if is_reduced:  # the wrench of the step itself decides, without poses
         _solve_levels(states)

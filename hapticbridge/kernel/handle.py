@@ -161,17 +161,17 @@ def move_handle(pose: Part, position: Vector, quaternion: Quaternion) -> None:
 
 @compiled
 def follow_in_part(
-    run: Part, pose: Part, share: float, moved: Vector, turned: Vector
+    run: Part, pose: Part, lever: float, moved: Vector, turned: Vector
 ) -> tuple[Vector, Quaternion]:
-    """Returns the handle's pose after a share of the device's motion.
+    """Returns the handle's pose after a part of the device's motion, by the lever.
 
         h_k = h_{k−1} + r · scale · A δp,    R_h,k = exp(r · A δφ) R_h,k−1
 
     With the force r f on the device, the handle moved by r times its motion takes up the work that
     the device does: a lever of ratio r.
     """
-    step = scaled(share * run.scale, scene_from_device(run.axes, moved))
-    turn = quaternion_exp(scaled(share, scene_from_device(run.axes, turned)))
+    step = scaled(lever * run.scale, scene_from_device(run.axes, moved))
+    turn = quaternion_exp(scaled(lever, scene_from_device(run.axes, turned)))
     position = add(vector_of(pose.handle_position), step)
     return position, canonical(product(turn, quaternion_of(pose.handle_quaternion)))
 

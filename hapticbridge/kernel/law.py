@@ -209,7 +209,7 @@ def limited(spring: Spring, u: Vector) -> Vector:
 
 
 @compiled
-def share_of_gains(spring: Spring, size: float, share: float, compliance: float) -> float:
+def next_gain_ratio(spring: Spring, size: float, share: float, compliance: float) -> float:
     """Returns c with c ‖u‖ = g(‖u‖) for ‖u‖ = A/(1 + c σ), at most 1.
 
     Args:
@@ -391,7 +391,7 @@ def set_gains(s: State, share: float) -> None:
     """
     mj = s.mj
     if mj.held_qpos != 0:
-        part = share * s.level.share[0]
+        part = share * s.level.gain_ratio[0]
         bias = floats(mj.biasprm + 8 * _GAINS * mj.coupling_actuator_id, 3)
         stiffness, damping = s.coupling.gains[1], s.coupling.gains[2]
         speed = s.pose.handle_step[0] / s.run.period
@@ -400,7 +400,7 @@ def set_gains(s: State, share: float) -> None:
         return
     for axis in range(6):
         first = 0 if axis < 3 else 3
-        part = share * s.level.share[0 if axis < 3 else 1]
+        part = share * s.level.gain_ratio[0 if axis < 3 else 1]
         actuator = mj.coupling_actuator_id + axis
         floats(mj.gainprm + 8 * _GAINS * actuator, 1)[0] = part * s.coupling.gains[first]
         bias = floats(mj.biasprm + 8 * _GAINS * actuator, 3)
@@ -430,7 +430,7 @@ def applied_wrench(s: State, share: float) -> tuple[Vector, Vector]:
 def _applied(s: State, axis: int, share: float) -> float:
     mj, h = s.mj, s.run.timestep
     actuator, row = mj.coupling_output_adr + axis, 0 if axis < 3 else 3
-    part = share * s.level.share[0 if axis < 3 else 1]
+    part = share * s.level.gain_ratio[0 if axis < 3 else 1]
     stiffness, damping = s.coupling.gains[row + 1], s.coupling.gains[row + 2]
     end = moment_dot(s, actuator, mj.qvel)
     change = moment_dot(s, actuator, mj.qacc)
@@ -591,7 +591,7 @@ def slip(s: State, max_stretch: float, max_twist: float) -> bool:
         new = _held(s, new, 0, length_at(linear, k.hold[0]))
         if angular.stiffness > 0.0:
             new_twist = _held(s, new_twist, 3, length_at(angular, k.hold[1]))
-    if s.guard.share == 0.0:
+    if s.guard.lever == 0.0:
         new = within(new, length_at(linear, k.idle[0]))
         if angular.stiffness > 0.0:
             new_twist = within(new_twist, length_at(angular, k.idle[1]))

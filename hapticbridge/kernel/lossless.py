@@ -441,7 +441,7 @@ def lossless_wrench(states: NDArray[np.void]) -> tuple[Vector, Vector, Vector, V
     lossless.ticks += lossless.was_midpoint
     if not lossless.is_midpoint:
         force, torque, moved, turned = limited_wrench_after_step(states, True)
-        if s.level.share[0] < 1.0 or s.level.share[1] < 1.0 or s.level.flags:
+        if s.level.gain_ratio[0] < 1.0 or s.level.gain_ratio[1] < 1.0 or s.level.flags:
             lossless.is_near = True
         return force, torque, moved, turned
     note_solved(s)

@@ -223,7 +223,7 @@ def unfelt_work(s: State, moved: Vector, turned: Vector) -> float:
     k, run, u = s.coupling, s.run, s.loop.unfelt
     if not k.lacks_motors:
         return 0.0
-    whole = s.guard.share * s.guard.share * run.force_scale
+    whole = s.guard.lever * s.guard.lever * run.force_scale
     linear = whole * run.scale * (0.5 * k.stiffness + k.damping / run.period)
     angular = whole / run.scale * (0.5 * k.rotational_stiffness + k.rotational_damping / run.period)
     work = 0.0

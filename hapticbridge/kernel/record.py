@@ -85,7 +85,7 @@ TICK_DTYPE = np.dtype(
         ("device_energy", "<f8"),
         ("injected_damping", "<f8"),
         ("injected_rotational_damping", "<f8"),
-        ("share", "<f8"),
+        ("lever", "<f8"),
         ("contact_tank", "<f8"),
         ("scene_step", "<i8"),
         ("scene_tank", "<f8"),
@@ -96,7 +96,7 @@ after the step. Positions are in m, quaternions (w, x, y, z) with w >= 0, energi
 works in J. Wrenches (force in N, torque in N m) are in the world frame about the grip
 (``wrench_on_tool``) or in the device's frame (``wrench_on_device``). ``injected_damping`` in N s/m
 and ``injected_rotational_damping`` in N m s/rad are the passivity controller's largest on any axis
-of that kind. ``share`` is the ratio of the lever between device and handle, 0 to 1: the share of
+of that kind. ``lever`` is the ratio of the lever between device and handle, 0 to 1: the part of
 the wrench that was sent, and of the device's motion to the next sample that the handle makes.
 ``contact_tank`` is the energy in J that may pay for the depenetration of rigid contacts
 (``kernel.rigid_contact``). ``scene_step`` counts the steps shown so far of a scene that is slower
@@ -127,7 +127,7 @@ def force_on_hand(ticks: NDArray[np.void], axes: ArrayLike) -> NDArray[np.float6
     """Returns the force of the device on the hand in the scene's frame, (n, 3) in N.
 
     It is ``wrench_on_device``, what the motors were sent, and opposite to the force on the tool
-    times ``force_scale`` and the recorded share.
+    times ``force_scale`` and the recorded lever.
 
     Args:
         ticks: Records, ``TICK_DTYPE``, (n,).

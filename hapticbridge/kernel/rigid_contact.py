@@ -174,7 +174,7 @@ RIGID_DTYPE = np.dtype(
         *((name, "<i8") for name in (*_PARAMETERS, *_OF_MODEL, *_OF_DATA, *_OWNED)),
         ("moving_count", "<i8"),
         ("pair_count", "<i8"),
-        ("share", "<f8"),
+        ("push_ratio", "<f8"),
         ("tank", "<f8"),
         ("cap", "<f8"),
         ("last_energy", "<f8"),
@@ -186,8 +186,8 @@ RIGID_DTYPE = np.dtype(
 )
 """Sub-record ``contact``, written by this module alone. ``is_rigid`` is 1 if contacts are rigid;
 ``repetitions`` counts repeated steps since the start, ``active_contacts`` the contacts with a
-force; ``share`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_energy`` Σ E_k in J at the
-last tick. ``is_aimed`` is 1 from the edit to the end of the step, ``corrections`` counts its
+force; ``push_ratio`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_energy`` Σ E_k in J at
+the last tick. ``is_aimed`` is 1 from the edit to the end of the step, ``corrections`` counts its
 repetitions for sliding, and ``lift`` is the largest velocity in m/s subtracted for it; ``ahead``
 the time in s for which margins reach ahead, and ``largest_margin`` their largest in m. ``leads`` is
 1 if the tool's margins follow the handle's speed, too. ``is_shifted`` is 1 if the step was repeated
@@ -253,7 +253,7 @@ def _aim(s: State) -> None:
     """Writes parameters and positions for ``mj_step2``, for the present share."""
     if s.contact.row_capacity > 0:
         _aim_rows(s)
-    mj, h, push = s.mj, s.run.timestep, s.contact.share * DEPENETRATION
+    mj, h, push = s.mj, s.run.timestep, s.contact.push_ratio * DEPENETRATION
     d = _IMPEDANCE
     count = ints(mj.nefc, 1)[0]
     velocities = floats(pointer_at(mj.efc_vel), count)
@@ -322,7 +322,7 @@ def _aim_rows(s: State) -> None:
     Their parameters are the model's, which has its own values again after the step.
     """
     mj, contact, h = s.mj, s.contact, s.run.timestep
-    push, d = contact.share * DEPENETRATION, _IMPEDANCE
+    push, d = contact.push_ratio * DEPENETRATION, _IMPEDANCE
     count = min(ints(mj.nefc, 1)[0], contact.row_capacity)
     kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
     velocities = floats(pointer_at(mj.efc_vel), count)
@@ -341,7 +341,7 @@ def _aim_rows(s: State) -> None:
         is_in_error = own[row] < 0.0 or kind == EQUALITY
         wanted = (-push if is_in_error else -1.0) * own[row] / h
         if kind == EQUALITY and has_moved:
-            wanted -= (1.0 - contact.share) * (own[row] - before[row]) / h
+            wanted -= (1.0 - contact.push_ratio) * (own[row] - before[row]) / h
         wanted -= shifts[row]
         positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
         margins[row] = 0.0
@@ -406,7 +406,7 @@ def aim_contacts(s: State) -> None:
     contact = s.contact
     if contact.is_rigid and ints(s.mj.nefc, 1)[0] > 0:
         has_energy = _spendable(s) > 0.0 or s.energy.mocap_has_moved
-        contact.share = 1.0 if has_energy else 0.0
+        contact.push_ratio = 1.0 if has_energy else 0.0
         contact.corrections = contact.is_shifted = contact.is_aimed = 0
         ints(contact.solver, 1)[0] = contact.own_solver
         _aim(s)
@@ -506,11 +506,11 @@ def aim_again(s: State) -> bool:
     allowed, returned = max(_spendable(s), 0.0), returned_energy(s)
     if s.energy.mocap_has_moved:
         allowed += mocap_work(s)  # the external port pays for it
-    if returned <= allowed or not (_shift_rows(s) or contact.share > 0.0):
+    if returned <= allowed or not (_shift_rows(s) or contact.push_ratio > 0.0):
         return False
     # C is nearly proportional to the share while the forces stay; a second excess ends it
-    is_first = contact.share == 1.0 and allowed > 0.0
-    contact.share = SPENDABLE * allowed / returned if is_first else 0.0
+    is_first = contact.push_ratio == 1.0 and allowed > 0.0
+    contact.push_ratio = SPENDABLE * allowed / returned if is_first else 0.0
     contact.repetitions += 1
     _aim(s)
     return True

@@ -35,8 +35,9 @@ Findings, for translation and rotation each; E is 8 mJ at a limit of 10 N or 0.5
     ms. The greatest ratio r of the lever between device and handle is halved, hence the stiffness
     quartered; again for each E_s >= E.
     slammed: Σ W² >= 0.9 of that above 4 Hz, Σ W·V <= b Σ V²/2, and b Σ V² − Σ W·V is 3 mW or more
-    at a limit of 10 N or 0.5 N m, for 0.3 s and until 8 mJ are missing. r is halved. No hand swings
-    so fast, so b Σ V² comes from the force, and it came late. Of an unknown damping b = 0 counts.
+    at a limit of 10 N or 0.5 N m, for 0.3 s and until 8 mJ are missing; at the end, half the mean or
+    more, since a single blow is forgotten. r is halved. No hand swings so fast, so b Σ V² comes
+    from the force, and it came late. Of an unknown damping b = 0 counts.
     coarse: 3 steps within 0.3 s. r is halved. A step is a new sample that follows equal ones of 4
     ms and more, and over which the coupling pulls with half the limit, r K ‖δp‖ >= F/2.
 
@@ -208,7 +209,7 @@ WATCH_DTYPE = np.dtype(
         ("ring_blocks", "<i8"),
         ("push", "<f8", 2),
         ("flags", "<i8"),
-        ("max_share", "<f8"),
+        ("max_lever", "<f8"),
         ("cap", "<f8"),
         ("rest", "<i8"),
         ("probe_end", "<i8"),
@@ -258,7 +259,7 @@ are translation and rotation.
 
 The first sixteen are thresholds and filters: ``sections`` those of the high-pass, ``corner`` the
 slow filters' gain per block, ``kept`` what the three memories keep of a block, ``limits`` in N and
-N m, ``late_energy`` E in J. ``cap`` is the greatest ratio after all findings, ``max_share`` the one
+N m, ``late_energy`` E in J. ``cap`` is the greatest ratio after all findings, ``max_lever`` the one
 allowed now, ``returns_to`` the ratio before a probe; ``probe_end`` and ``rest_end`` in blocks.
 ``wrench`` and ``motion`` are sums over the block. ``wrench_square`` to ``across`` are the sums over
 W and A, ``whole_square`` that of all acceleration; ``believed`` and ``delayed`` are E_0 and E_s;
@@ -275,7 +276,7 @@ the block ``rings_end``."""
 def bind_watch(watch: Part, parameters: RunParameters) -> None:
     """Fills in the thresholds; without a finite one there is no watch."""
     limits, period = parameters.guarding, parameters.period
-    watch["max_share"] = watch["cap"] = 1.0
+    watch["max_lever"] = watch["cap"] = 1.0
     if not math.isfinite(min(limits.swing_energy, limits.runaway_speed)):
         return
     watch["block_ticks"] = ticks = max(round(BLOCK / period), 1)
@@ -317,7 +318,7 @@ def _butterworth(corner: float) -> list[float]:
 
 @compiled
 def watch_device(s: State, moved: Vector, turned: Vector, interval: float) -> None:
-    """Takes the motion in which the last wrench was held, and lowers ``max_share`` if it must.
+    """Takes the motion in which the last wrench was held, and lowers ``max_lever`` if it must.
 
     Args:
         s: The bound state, before the new wrench.
@@ -359,7 +360,7 @@ def _count_step(s: State, kind: int, motion: Vector, interval: float, stiffness:
         return
     was_still = still[kind] >= max(watch.block_ticks, 2) and interval < 2.0 * s.run.period
     still[kind] = 0
-    if was_still and s.guard.share * stiffness * norm(motion) >= STEP * watch.limits[kind]:
+    if was_still and s.guard.lever * stiffness * norm(motion) >= STEP * watch.limits[kind]:
         watch.steps[kind] += 1.0
 
 
@@ -392,11 +393,11 @@ def _close_block(s: State) -> None:
         watch.probe_end = watch.blocks + watch.probe_blocks
         watch.rest_end = watch.probe_end + watch.rest
         watch.rest = min(2 * watch.rest, watch.longest_rest)
-        watch.returns_to = s.guard.share
+        watch.returns_to = s.guard.lever
     is_probing = watch.blocks < watch.probe_end or watch.is_held[0] + watch.is_held[1] > 0
-    watch.max_share = PROBE_SHARE * watch.cap if is_probing else watch.cap
+    watch.max_lever = PROBE_SHARE * watch.cap if is_probing else watch.cap
     watch.flags &= ~PROBED
-    if is_probing or s.guard.share < watch.returns_to:
+    if is_probing or s.guard.lever < watch.returns_to:
         watch.flags |= PROBED
     else:
         watch.returns_to = 0.0
@@ -550,7 +551,7 @@ def _add_block(s: State, kind: int) -> None:
         turn = watch.mean_wrench[j] * watch.change[k] - watch.mean_wrench[k] * watch.change[j]
         watch.across[at] = kept * watch.across[at] + block * turn
     size = math.sqrt(square)
-    if size < RESISTED * watch.limits[kind] * s.guard.share or size == 0.0 or against <= 0.0:
+    if size < RESISTED * watch.limits[kind] * s.guard.lever or size == 0.0 or against <= 0.0:
         watch.gained[kind] = 0.0
     else:
         watch.gained[kind] = max(watch.kept[2] * watch.gained[kind] + change / size, 0.0)
@@ -604,8 +605,9 @@ def _is_slammed(s: State, kind: int) -> bool:
         watch.counts[6 * kind + 5] += 1
     else:
         watch.lacking[kind] = watch.counts[6 * kind + 5] = 0
-    is_long = watch.counts[6 * kind + 5] >= watch.ring_blocks
-    return bool(is_long and watch.lacking[kind] >= enough)
+    count, lacking = watch.counts[6 * kind + 5], watch.lacking[kind]
+    goes_on = 2.0 * power * count * watch.block >= lacking  # not one blow that is being forgotten
+    return bool(count >= watch.ring_blocks and lacking >= enough and goes_on)
 
 
 @compiled
@@ -619,7 +621,7 @@ def _verdict(s: State, kind: int) -> int:
         late = 0.0
     enough = watch.late_energy[kind] * watch.cap
     wrench, change = watch.wrench_square[kind], watch.change_square[kind]
-    least = KNOWN_WRENCH * (watch.limits[kind] * s.guard.share) ** 2
+    least = KNOWN_WRENCH * (watch.limits[kind] * s.guard.lever) ** 2
     is_known = wrench > max(least, 0.0) and change > KNOWN_MOTION * watch.whole_square[kind]
     power, along, across, delay = 1.0, 1.0, 1.0, 0.0
     if is_known and watch.speed_square[kind] > 0.0:

@@ -136,7 +136,7 @@ from hapticbridge.kernel.springs import restore_springs
 from hapticbridge.kernel.swing_watch import watch_device
 from hapticbridge.kernel.tick_guard import (
     DEVICE_BUTTONS,
-    advance_share,
+    advance_lever,
     note_anchored,
     refusal,
     send_within,
@@ -224,13 +224,13 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
     move_device(pose, position, quaternion)
 
     buttons = (sample.buttons & DEVICE_BUTTONS) | s.guard.commanded
-    share = s.guard.share  # of the wrench that was held until now
-    if share == 1.0:
+    lever = s.guard.lever  # of the wrench that was held until now
+    if lever == 1.0:
         handle, orientation = handle_pose(s.run, pose, position, quaternion)
     else:
-        handle, orientation = follow_in_part(s.run, pose, share, moved, turned)
+        handle, orientation = follow_in_part(s.run, pose, lever, moved, turned)
     move_handle(pose, handle, orientation)
-    advance_share(s, position, buttons, elapsed)
+    advance_lever(s, position, buttons, elapsed)
     max_stretch = max_twist = np.inf
     is_timed = s.run.has_law and s.guard.has_hand and s.loop.tick > s.guard.start_tick
     if is_timed:
@@ -249,7 +249,7 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
         meter_debt(s)
     if has_slipped and s.run.scheme == Scheme.MIDPOINT:
         note_slip(s)
-    if has_slipped or (share < 1.0 and (moved != _AT_REST or turned != _AT_REST)):
+    if has_slipped or (lever < 1.0 and (moved != _AT_REST or turned != _AT_REST)):
         anchor_handle(pose)
         note_anchored(s.guard)
     row.buttons = buttons
@@ -557,7 +557,7 @@ def send_wrench(s: State, row: State, contacts: int) -> int:
 def _render(s: State, force: Vector, torque: Vector) -> None:
     """Turns the wrench on the tool into the wrench on the device.
 
-    In this order: scale, axes with a motor, share of the lever, of the passivity controller's
+    In this order: scale, axes with a motor, the lever, share of the passivity controller's
     damping what fits, and the energy limit at full speed.
     """
     run = s.run
@@ -565,14 +565,14 @@ def _render(s: State, force: Vector, torque: Vector) -> None:
         force, torque = limited_wrench(s, force, torque)
     force = scaled(-run.force_scale, device_from_scene(run.axes, force))
     torque = scaled(-run.force_scale / run.scale, device_from_scene(run.axes, torque))
-    share = s.guard.share
+    lever = s.guard.lever
     if s.coupling.lacks_motors:
         whole, whole_torque = force, torque
         force, torque = felt(s, force, torque)
-        store_vector(s.loop.unfelt[0:3], scaled(share, subtract(whole, force)))
-        store_vector(s.loop.unfelt[3:6], scaled(share, subtract(whole_torque, torque)))
-    if share != 1.0:
-        force, torque = scaled(share, force), scaled(share, torque)
+        store_vector(s.loop.unfelt[0:3], scaled(lever, subtract(whole, force)))
+        store_vector(s.loop.unfelt[3:6], scaled(lever, subtract(whole_torque, torque)))
+    if lever != 1.0:
+        force, torque = scaled(lever, force), scaled(lever, torque)
     force, torque = send_within(s, (force, torque), control(s, force, torque))
     force, torque = within_energy_limit(s, force, torque)
     store_vector(s.loop.wrench_on_device[0:3], force)
@@ -679,7 +679,7 @@ def _record(s: State, r: State) -> None:
     r.environment_energy, r.device_energy = energy.environment_energy, energy.device_energy
     r.injected_damping = s.observer.injected_damping
     r.injected_rotational_damping = s.observer.injected_rotational_damping
-    r.share = s.guard.share
+    r.lever = s.guard.lever
     r.contact_tank = s.contact.tank
     r.scene_step, r.scene_tank = s.shown.scene_step, s.shown.tank
 

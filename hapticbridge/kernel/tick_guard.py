@@ -66,7 +66,7 @@ GUARD_DTYPE = np.dtype(
         ("silent_tick", "<i8"),
         ("start_tick", "<i8"),
         ("rise_ticks", "<i8"),
-        ("share", "<f8"),
+        ("lever", "<f8"),
     ]
 )
 """Sub-record ``guard``, written by this module alone.
@@ -76,7 +76,7 @@ The first fields are those of ``GuardParameters``, the trips as ``max_*``. ``com
 ``time_since_sample`` is the time in s since the last new sample, 0 in a tick with one;
 ``silence`` the length in s of the last interval without one, 0 once the force has come back;
 ``longest_silence`` the longest in s of the whole run, and ``silent_tick`` its last tick;
-``fresh`` counts the ticks with a new sample; ``share`` is r, the ratio of the lever between
+``fresh`` counts the ticks with a new sample; ``lever`` is r, the ratio of the lever between
 device and handle; ``rise_ticks`` its time from 0 to 1."""
 
 FARTHEST = 2.0
@@ -103,14 +103,14 @@ def bind_guard(guard: Part, parameters: RunParameters) -> None:
 
 
 def restart_ramp(guard: Part, tick: int, length: int) -> None:
-    """Lets the share rise from zero within so many ticks; without a hand it may be 1 at once."""
+    """Lets the lever rise from zero within so many ticks; without a hand it may be 1 at once."""
     guard["start_tick"], guard["rise_ticks"] = tick, length
-    guard["share"] = 0.0 if guard["has_hand"] or length > 0 else 1.0
+    guard["lever"] = 0.0 if guard["has_hand"] or length > 0 else 1.0
 
 
 def let_go(guard: Part) -> None:
     """Lets the handle go: it does not follow the device's next motion."""
-    guard["share"], guard["rise_ticks"] = 0.0, guard["fade_ticks"]
+    guard["lever"], guard["rise_ticks"] = 0.0, guard["fade_ticks"]
 
 
 def set_commanded(guard: Part, bits: int) -> None:
@@ -134,7 +134,7 @@ def refusal(s: State, moved: Vector, turned: Vector, elapsed: float) -> int:
         return BACKWARDS
     # the device moves on while its samples are old, and catches up after a silence
     time = max(elapsed, s.run.period) + guard.time_since_sample
-    if guard.share <= CATCH_UP:
+    if guard.lever <= CATCH_UP:
         time += guard.silence
     is_fast = norm(moved) > guard.max_speed * time or norm(turned) > guard.max_turn_speed * time
     # between a start and the first tick the device moves for an unknown time
@@ -151,7 +151,7 @@ def refusal(s: State, moved: Vector, turned: Vector, elapsed: float) -> int:
 
 
 @compiled
-def advance_share(s: State, position: Vector, buttons: int, elapsed: float) -> None:
+def advance_lever(s: State, position: Vector, buttons: int, elapsed: float) -> None:
     """Advances r by one tick: to 0 while the hand is let go, else to 1 or the watch's cap.
 
     The hand is let go while a clutch is held (by a button or by command), while a dead-man button
@@ -183,19 +183,19 @@ def advance_share(s: State, position: Vector, buttons: int, elapsed: float) -> N
     is_off = is_clutched or (buttons & FORCE_OFF) != 0
     is_off = is_off or (guard.stale_ticks > 0 and guard.consecutive_stale > guard.stale_ticks)
     if is_off:
-        guard.share = max(guard.share - 1.0 / guard.fade_ticks, 0.0)
-        if guard.share == 0.0:
+        guard.lever = max(guard.lever - 1.0 / guard.fade_ticks, 0.0)
+        if guard.lever == 0.0:
             guard.rise_ticks = guard.fade_ticks
-    elif guard.share > s.watch.max_share:
-        guard.share = max(guard.share - 1.0 / guard.fade_ticks, s.watch.max_share)
+    elif guard.lever > s.watch.max_lever:
+        guard.lever = max(guard.lever - 1.0 / guard.fade_ticks, s.watch.max_lever)
         if s.watch.flags & RUNS_AWAY:  # a reversed force must not last for a fade
-            guard.share = s.watch.max_share
-    elif guard.share < s.watch.max_share:
+            guard.lever = s.watch.max_lever
+    elif guard.lever < s.watch.max_lever:
         rise = guard.fade_ticks if s.watch.flags & PROBED else guard.rise_ticks + 1.0
-        guard.share = min(guard.share + 1.0 / rise, s.watch.max_share)
-    if guard.share > CATCH_UP:
+        guard.lever = min(guard.lever + 1.0 / rise, s.watch.max_lever)
+    if guard.lever > CATCH_UP:
         guard.silence = 0.0
-    if guard.share < 1.0:
+    if guard.lever < 1.0:
         guard.flags |= RAMPING
 
 

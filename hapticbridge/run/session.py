@@ -544,8 +544,8 @@ class Session:
         is_missing = slow.is_missing
         if is_missing != self._is_held and not self.executor.later:
             self._is_held ^= self.commands.hold(is_missing, "scene")
-        share = self.kernel.bound.state["guard"]["share"][0]
-        if is_missing and share == 0.0 and not self._has_warned:
+        lever = self.kernel.bound.state["guard"]["lever"][0]
+        if is_missing and lever == 0.0 and not self._has_warned:
             self._has_warned = True
             warnings.warn(
                 f"a step of scene '{self.setup.scene.name}' takes more than {LONGEST_WAIT:g} s: "
