@@ -35,8 +35,8 @@ Findings, for translation and rotation each; E is 8 mJ at a limit of 10 N or 0.5
     ms. The greatest ratio r of the lever between device and handle is halved, hence the stiffness
     quartered; again for each E_s >= E.
     slammed: Σ W² >= 0.9 of that above 4 Hz, Σ W·V <= b Σ V²/2, and b Σ V² − Σ W·V is 3 mW or more
-    at a limit of 10 N or 0.5 N m, for 0.3 s and until 8 mJ are missing; at the end, half the mean or
-    more, since a single blow is forgotten. r is halved. No hand swings so fast, so b Σ V² comes
+    at a limit of 10 N or 0.5 N m, for 0.3 s and until 8 mJ are missing; at the end, half the mean
+    or more, since a single blow is forgotten. r is halved. No hand swings so fast, so b Σ V² comes
     from the force, and it came late. Of an unknown damping b = 0 counts.
     coarse: 3 steps within 0.3 s. r is halved. A step is a new sample that follows equal ones of 4
     ms and more, and over which the coupling pulls with half the limit, r K ‖δp‖ >= F/2.
