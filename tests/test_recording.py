@@ -102,7 +102,7 @@ def test_schema_lists_every_field_with_its_type() -> None:
     assert lines[0] == "int64 tick"
     assert "float64[3] device_position # m" in lines
     assert "float64[6] wrench_on_device # N, N m" in lines
-    assert "float64 share" in lines
+    assert "float64 lever" in lines
     assert len(lines) == len(TICK_DTYPE.names or ())
 
 
