@@ -2,10 +2,11 @@
 
 With e = h − x and φ the rotation vector from tool to handle, the wrench on the tool is
 
-    f = K e + (B'/T) (δh − δx),    τ = K_r φ + (B'_r/T) (δφ_h − δφ_x)
+    f = g(‖u‖) u/‖u‖,    u = K e + (B'/T) (δh − δx),    g(‖u‖) = min(‖u‖, F)
+    τ alike,             u = K_r φ + (B'_r/T) (δφ_h − δφ_x)
 
-K in N/m, B' in N s/m, K_r in N m/rad, B'_r in N m s/rad; h and x are the positions of handle and
-tool in m, δ their steps within the time T in s. The six actuators of the scene evaluate this law
+K in N/m, B' in N s/m, K_r in N m/rad, B'_r in N m s/rad; F is the force level in N, or N m; h and
+x are the positions of handle and tool in m, δ their steps within the time T in s. The six actuators of the scene evaluate this law
 inside MuJoCo's step; ``law_wrench`` evaluates it afterwards, at the poses that resulted. The two
 agree because the actuators are implicit: MuJoCo solves them at the end of the step.
 
@@ -295,7 +296,7 @@ def _slack(
     moved, u = vector_of(motion), vector_of(wrench)
     square = dot(moved, moved)
     change = gain * math.sqrt(square)
-    if s.run.law_evaluations > 1:  # ``gain`` is this share of that of one evaluation
+    if s.run.law_evaluations > 1:  # ``gain`` is SLACK_SHARE times that of one evaluation
         change *= 1.0 / SLACK_SHARE
     return 0.5 * gain * square if is_straight(spring, math.sqrt(dot(u, u)), change) else 0.0
 
