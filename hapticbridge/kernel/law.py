@@ -6,9 +6,10 @@ With e = h − x and φ the rotation vector from tool to handle, the wrench on t
     τ alike,             u = K_r φ + (B'_r/T) (δφ_h − δφ_x)
 
 K in N/m, B' in N s/m, K_r in N m/rad, B'_r in N m s/rad; F is the force level in N, or N m; h and
-x are the positions of handle and tool in m, δ their steps within the time T in s. The six actuators of the scene evaluate this law
-inside MuJoCo's step; ``law_wrench`` evaluates it afterwards, at the poses that resulted. The two
-agree because the actuators are implicit: MuJoCo solves them at the end of the step.
+x are the positions of handle and tool in m, δ their steps within the time T in s. The six actuators
+of the scene evaluate this law inside MuJoCo's step; ``law_wrench`` evaluates it afterwards, at the
+poses that resulted. The two agree because the actuators are implicit: MuJoCo solves them at the end
+of the step.
 
 In four cases the handle's end of the spring moves without the device: it slips. These are changed
 gains, a late sample, an axis without motor, and a hand that is let go (``slip``). With gains that
