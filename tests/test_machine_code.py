@@ -110,6 +110,17 @@ def test_machine_code_from_disk_does_what_python_does(name: str, folder: Path) -
     assert bool(machine_code.read(path)) == (name != "allocation")
 
 
+@pytest.mark.parametrize("name", CASES)
+def test_numba_compiles_where_the_linkers_rules_are_not_known(
+    name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "platform", "darwin")
+    function, arguments = CASES[name]
+    given, expected = arguments(), arguments()
+    assert direct(compiled(function), *given)(*given) == function(*expected)
+    assert not list(folder.glob("*.o"))
+
+
 def test_an_exception_is_raised_although_machine_code_cannot(folder: Path) -> None:
     function = direct(compiled(raising), np.zeros((1, 1)))
     assert function(np.zeros((1, 1))) == 1
