@@ -15,6 +15,7 @@ from cli_cases import Called
 
 from hapticbridge import Coupling
 from hapticbridge.audit import audit
+from hapticbridge.audit.batch import audit_all
 from hapticbridge.audit.events import AuditedRun
 from hapticbridge.cli import zwidth
 from hapticbridge.demand.certification import Standing
@@ -90,6 +91,8 @@ def test_a_certificate_names_a_delay_that_is_stated_and_was_not_measured(
         assert found.standing is Standing.CERTIFIED
         said = [clause in text for text in (found.words, found.fact, found.note)]
         assert said == [not is_measured] * 3
+        assert found.answer == ("yes" if is_measured else "if timely")
+    assert list(audit_all([path]).texts("certified")) == [report.answer]
     opened = SimulatedDevice()
     opened.info = sheet
     monkeypatch.setattr(zwidth, "open_device", lambda _spec, notify: opened)

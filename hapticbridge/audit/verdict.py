@@ -177,8 +177,8 @@ class AuditReport:
 
     @property
     def answer(self) -> str:
-        """Verdict on the device in a table: yes, no or not judged."""
-        return {True: "yes", False: "no", None: "not judged"}[self.certified]
+        """Verdict on the device in a table; an invalid file has none."""
+        return "not judged" if self.certification is None else self.certification.answer
 
     @property
     def timekeeping(self) -> Timekeeping | None:

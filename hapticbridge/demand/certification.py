@@ -117,6 +117,13 @@ class Certification:
         return self.standing in (Standing.TIME, Standing.ALARM)
 
     @property
+    def answer(self) -> str:
+        """Verdict in a table; ``if timely``: no measurement confirms that there is no delay."""
+        if self.verdict:
+            return "if timely" if self._if else "yes"
+        return "not judged" if self.verdict is None else "no"
+
+    @property
     def words(self) -> str:
         """Verdict in a clause; ``reason`` has the cause in full."""
         if self.standing is Standing.NO_HAND:

@@ -51,10 +51,15 @@ def falcon() -> FalconModel:
 
 
 def turning_falcon() -> FalconModel:
-    """Returns a Falcon in a hand that moves to and fro along y, as with a spanner."""
+    """Returns a Falcon in a hand that moves to and fro along y, as with a spanner.
+
+    It rests for 0.4 s at each end, because force is enabled only at rest, then moves for 0.4 s.
+    """
     times = np.arange(0.0, 60.0, 0.02)
+    stroke, phase = np.divmod(times / 0.8, 1.0)
+    way = np.sin(np.pi * np.maximum(phase - 0.5, 0.0)) ** 2
     places = np.zeros((len(times), 3))
-    places[:, 1] = 0.015 * np.sin(2.0 * np.pi * times)
+    places[:, 1] = 0.03 * np.where(stroke % 2.0, 1.0 - way, way)
     mechanics = SimulatedDevice(
         mass=MASS, damping=DAMPING, friction=FRICTION, hand=FIRM, path=Motion(times, places)
     )

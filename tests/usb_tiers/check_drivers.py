@@ -218,7 +218,7 @@ def test_a_falcon_turns_the_nut_of_a_bolt_that_a_spacemouse_holds(
 
 
 TURN = 0.8
-"""Time in s for which the nut is turned, to and fro in 1 s."""
+"""Time in s for which the nut is turned: one rest and one stroke of the hand."""
 
 
 def _pulled_out_of_a_run(
