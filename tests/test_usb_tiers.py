@@ -84,7 +84,7 @@ def test_runs_that_are_one_to_the_bit_do_not_part_and_a_nan_is_like_itself() -> 
 @pytest.mark.parametrize(
     ("field", "part", "values", "named"),
     [
-        ("wake_ns", 3, (3_000_256, 3_000_000), "wake_ns 3000256 and 3000000 ns"),
+        ("wake_ns", 3, (3_001_024, 3_000_000), "wake_ns 3001024 and 3000000 ns"),
         ("wrench_on_device", (3, 4), (0.25, 0.5), "wrench_on_device_ty 0.25 and 0.5 N m"),
         ("kinetic", 3, (0.0, -0.0), "kinetic 0.0 and -0.0 J"),
     ],
@@ -102,7 +102,8 @@ def test_where_two_runs_part_is_told(field: str, part: Any, values: Any, named: 
     ("late", "status", "told"),
     [
         (0, 0, "5 ticks, "),
-        (256, 0, "runs 1 and 3: record 4 (ticks 4 and 4) is the first that differs: wake_ns"),
+        (512, 0, "5 ticks, "),
+        (1024, 0, "runs 1 and 3: record 4 (ticks 4 and 4) is the first that differs: wake_ns"),
         (0, 3, "run 3 of 3 ended with status 3 after 1.5 s of this machine's time"),
     ],
 )
@@ -117,7 +118,7 @@ def test_odd_run_is_told(tmp_path: Path, late: int, status: int, told: str) -> N
         return GuestRun(ended, f"guest {number} says so", 1.5, "its kernel too"), file
 
     verdict, note = repeated(run, 3)
-    assert verdict == (late == status == 0)
+    assert verdict == (late < 1000 and status == 0)
     assert note.startswith(told)
     for said in ("guest 3 says so", "its kernel too"):
         assert (said in note) != verdict

@@ -67,8 +67,7 @@ class Lag:
 
     Attributes:
         ticks_per_sample: n, ticks of the loop for which one force is held; at least 1.
-        delay: t_d in s from a sample to its force, >= 0, in whole ticks of the loop, rounded up. An
-            unknown delay counts as 0.
+        delay: t_d in s from a sample to its force, >= 0. An unknown delay counts as 0.
     """
 
     ticks_per_sample: int = 1
@@ -77,8 +76,7 @@ class Lag:
     @classmethod
     def of(cls, info: DeviceInfo, period: float) -> Lag:
         """Returns that of a device on a loop of period T in s."""
-        delay = (delay_ticks(info, period) or 0) * period
-        return cls(whole_ticks(device_period(info, period), period), delay)
+        return cls(whole_ticks(device_period(info, period), period), info.delay or 0.0)
 
 
 IN_TIME = Lag()

@@ -201,7 +201,7 @@ def _closed_loop(ended: GuestRun, device: str, file: Path) -> Claim:
 
 
 def _the_same_every_time(folder: Path) -> list[Claim]:
-    name = f"a 1 kHz loop in virtual time is the same to the bit in {REPEATS} runs"
+    name = f"a 1 kHz loop in virtual time is the same in {REPEATS} runs: to the bit, times to 1 µs"
     _compile_ahead()
     snapshot = snapshot_of_compiled_code(folder / "compiled")
 
