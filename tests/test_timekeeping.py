@@ -108,7 +108,7 @@ def at_once(_tick: int) -> float:
 
 
 def stroke(tick: int) -> tuple[float, ...]:
-    """A hand that swings by 25 mm, at most at 0.5 m/s, and presses the wall in its second stroke."""
+    """A hand that swings by 25 mm, at most at 0.5 m/s, and presses the wall at its second turn."""
     return (0.025 * np.sin(0.02 * tick), 0, 0, 1, 0, 0, 0)
 
 
