@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from audit_cases import ScriptedDevice, SlowClock, recorded, stroke
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
@@ -273,6 +274,57 @@ def test_the_condition_of_a_shorter_tick_fails_on_it(tmp_path: Path) -> None:
     assert report.certified is False
     assert "device damping 2 < 7.13846 N s/m with one sample in 8 ticks" in report.conditions[0]
     assert "device damping 2 < 7.13846 N s/m with one sample in 8 ticks" in summary.conditions[0]
+
+
+@pytest.mark.parametrize("late", [0.25, 1.0, 1.5, 3.0, 8.0])
+def test_a_late_device_that_is_certified_gives_no_energy(late: float) -> None:
+    rng, certified = np.random.default_rng(int(100 * late)), 0
+    for scene in ("virtual_wall", "point_mass") * 3:
+        device = OwnDevice(
+            (10 ** rng.uniform(0, 4), 10 ** rng.uniform(-1, 0.5)),
+            late=lambda _: late,
+            mass=10 ** rng.uniform(-1.3, 0),
+            start=(rng.uniform(0, 5e-3), rng.uniform(0, 0.5)),
+            delay=late * T,
+        )
+        ratio = T * 10 ** rng.uniform(-1, 1)
+        most = 0.999 * 2.0 / float(late_minimum_damping(1.0, ratio, T, late * T))
+        law = Coupling(most, ratio * most, 1e-3 * most, 1e-3 * ratio * most)
+        summary = run(device, default_method().requested_coupling(law, T), scene=scene)
+        certified += summary.is_certified is True
+        assert device.gained < 1e-6
+    assert certified >= 4
+
+
+def test_a_walls_rule_fails_behind_a_delay_and_is_not_certified(tmp_path: Path) -> None:
+    # b >= K (T/2 + t_d) holds for a wall alone; this tool yields
+    law = Coupling(2.0 / (T / 2 + 3 * T), 0.0, 0.5, 0.0)
+    gained = []
+    for stiffness in (30.0, 300.0, 3000.0):
+        device = OwnDevice((stiffness, 0.05), late=lambda _: 3.0, delay=3 * T)
+        requested = default_method().requested_coupling(law, T)
+        summary = run(device, requested, tmp_path / "wall.mcap")
+        assert summary.is_certified is audit(tmp_path / "wall.mcap").certified is False
+        gained.append(device.gained)
+    assert max(gained) > 0.01
+
+
+def test_forces_later_than_stated_are_counted_where_the_loop_was_late(tmp_path: Path) -> None:
+    # the loop sends its forces most of a tick late while the hand presses the wall
+    path, found = tmp_path / "late.mcap", []
+    for share in (0.0, 0.9):
+        clock = SlowClock({})
+        spend = lambda sent, s=share: clock.spend(s * (365 < sent < 430))  # noqa: B023, E731
+        device = ScriptedDevice(stroke, on_write=spend, delay=1e-3)
+        law = Coupling(*stiffest_late_coupling(2.0, T, T, 1), 2e-4, 2e-4)
+        requested = default_method().requested_coupling(law, T)
+        summary = recorded(path, "virtual_wall", device, requested, clock=clock, duration=1.0)
+        report = audit(path)
+        assert report.timekeeping is not None
+        told = summary.timekeeping.delay_energy
+        assert report.timekeeping.delay_energy == pytest.approx(told, rel=1e-6, abs=1e-12)
+        found.append(told)
+    assert found[1] > found[0]
 
 
 def test_the_rate_of_a_slow_device_is_proposed() -> None:
