@@ -99,7 +99,7 @@ from hapticbridge.kernel.tick_guard import (
     restart_ramp,
     set_commanded,
 )
-from hapticbridge.kernel.timing import TIMING_DTYPE
+from hapticbridge.kernel.timing import TIMING_DTYPE, bind_timing
 
 MujocoStep = Callable[[mujoco.MjModel, mujoco.MjData], None]
 
@@ -402,7 +402,7 @@ class BoundKernel:
         bind_guard(s["guard"], parameters)
         bind_observer(s["observer"], parameters.guarding)
         bind_watch(s["watch"], parameters)
-        s["timing"]["device_delay_ns"] = round(1e9 * parameters.guarding.stated_delay)
+        bind_timing(s["timing"], parameters.guarding.stated_delay)
         bind_shown(s["shown"], parameters)
         is_rigid = parameters.is_rigid and not parameters.scene_ticks and self._meters_scene
         own = replace(parameters, is_rigid=is_rigid)

@@ -104,20 +104,25 @@ def note_motion(s: State, moved: Vector, turned: Vector, lever: float, is_timed:
     store_vector(t.moved[3:], turned)
 
 
+def bind_timing(timing: Part, stated_delay: float) -> None:
+    """Fills in the delay that the device states, in s."""
+    timing["device_delay_ns"] = round(1e9 * stated_delay)
+
+
 @compiled
-def _advance(t: Part, end: int) -> None:
+def _advance(timing: Part, end: int) -> None:
     """Adds the wrenches that the device held until a time in ns."""
-    while t.now < end:
+    while timing.now < end:
         until, is_last = end, True
-        if t.held < t.newest and t.arrivals[(t.held + 1) % RING] < end:
-            until, is_last = max(t.arrivals[(t.held + 1) % RING], t.now), False
-        time, w = 1e-9 * (until - t.now), t.wrenches[t.held % RING]
+        if timing.held < timing.newest and timing.arrivals[(timing.held + 1) % RING] < end:
+            until, is_last = max(timing.arrivals[(timing.held + 1) % RING], timing.now), False
+        time, w = 1e-9 * (until - timing.now), timing.wrenches[timing.held % RING]
         for i in range(6):
-            t.impulse[i] += time * w[i]
-            t.square[i] += time * w[i] * w[i]
-        t.now = until
+            timing.impulse[i] += time * w[i]
+            timing.square[i] += time * w[i] * w[i]
+        timing.now = until
         if not is_last:
-            t.held += 1
+            timing.held += 1
 
 
 @compiled
