@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from emulated.rawhid_model import crc
-from firmware_build import COMPILER, FIRMWARE, built
+from firmware_build import COMPILER, FIRMWARE, LIBRARY, built
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -355,8 +355,8 @@ def sketch_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "struct Encoder { Encoder(int, int) {} void write(int) {}\n"
         "                 int read() { return encoder_count; } };\n"
     )
-    library = built(folder, f'-DSKETCH="{FIRMWARE / "hapticbridge_rawhid.ino"}"')
-    return Path(library._name)
+    built(folder, f'-DSKETCH="{FIRMWARE / "hapticbridge_rawhid.ino"}"')
+    return folder / LIBRARY
 
 
 @pytest.fixture
