@@ -203,7 +203,7 @@ def test_an_index_without_room_on_disk_is_whole(
             places[0] -= (written := write(data[: places[0]]))
             return written
 
-        file.write = limited
+        file.write = limited  # type: ignore[assignment, method-assign]
         return file
 
     monkeypatch.setattr(tempfile, "TemporaryFile", small)
