@@ -198,7 +198,7 @@ def test_an_index_without_room_on_disk_is_whole(
 
         def limited(data: bytes) -> int:
             if places[0] == 0:
-                places[0] = 10**6  # somebody has made room since
+                places[0] = 10**6  # room was made since
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             places[0] -= (written := write(data[: places[0]]))
             return written
