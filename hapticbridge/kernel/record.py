@@ -104,8 +104,8 @@ than the loop, and ``scene_tank`` is the energy in J that the hand has given and
 yet got; both are 0 for a scene that steps in every tick (``kernel.shown_tool``)."""
 
 FORMAT = "1"
-"""Format of a recording: its fields, and its metadata with the numbers that follow from a request.
-A recording of another format is refused.
+"""Format of a recording: its fields, the request with its options, and the numbers that follow from
+it. A recording of another format is refused, so other fields in any of them need the next number.
 
 To add a field:
 
