@@ -303,6 +303,14 @@ class RunParameters:
         return Grip.from_text(self.grip).is_joint
 
     @property
+    def levels_on_tool(self) -> tuple[float, float]:
+        """Force level F in N and F_r in N m on the tool, from the limits on the device."""
+        return (
+            self.force_limit / self.force_scale,
+            self.torque_limit * self.scale / self.force_scale,
+        )
+
+    @property
     def tank_cap(self) -> float:
         """Largest energy in J that may pay for the depenetration of rigid contacts, ½ K c²."""
         return 0.5 * self.coupling.stiffness * TANK_STRETCH**2
@@ -310,6 +318,7 @@ class RunParameters:
     @property
     def of_scene(self) -> RunParameters:
         """Parameters of a slower scene's own loop; its device is the handle."""
+        force_limit, torque_limit = self.levels_on_tool
         return replace(
             self,
             period=self.scene_period,
@@ -318,8 +327,8 @@ class RunParameters:
             scale=1.0,
             force_scale=1.0,
             axes=SAME_AXES,
-            force_limit=self.force_limit / self.force_scale,
-            torque_limit=self.torque_limit * self.scale / self.force_scale,
+            force_limit=force_limit,
+            torque_limit=torque_limit,
             ramp_ticks=0,
             device_origin=IDENTITY_POSE,
             handle_origin=IDENTITY_POSE,

@@ -543,7 +543,7 @@ class RunSetup:
 
     def overload(self, parameters: RunParameters) -> str:
         """Returns why the device cannot hold the tool, as a clause; empty if it can."""
-        scene, most = self.scene, self.limits.force
+        scene, most = self.scene, self._sent(parameters.levels_on_tool[0])
         if not self.method.has_law or self.info.is_prescribed or scene.is_carried:
             return ""
         if (force := self._sent(holding_force(scene, parameters))) > most:
