@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import (
-    COMPENSATED,
-    IMPLICIT,
     Method,
     RunCoupling,
     default_method,
+    guaranteed_methods,
 )
 from hapticbridge.plotting import new_figure
 from hapticbridge.theory.bounds import late_minimum_damping, minimum_damping, worst_frequency
@@ -107,13 +106,10 @@ def alternatives(requested: Coupling, period: float, filter_time: float) -> tupl
         name = f"{method.name}: B = {shown.damping:.4g} effective (law {used.damping:.4g})"
         return way(name, law=used)
 
-    methods = [
-        by_method(method) for method in dict.fromkeys((default_method(), COMPENSATED, IMPLICIT))
-    ]
     frequency = _frequencies(period)
     line = transmission_line_spectrum(requested.stiffness * period, period, frequency)
     return (
-        *methods,
+        *map(by_method, guaranteed_methods().values()),
         way("B_law = B at half the period", step=period / 2),
         way(f"B_law = B, low-pass of {1e3 * filter_time:g} ms on it", low_pass=filter_time),
         way("B_law = B, Tustin's damper", scheme="tustin"),

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from hapticbridge.arguments import Rule, check_fields, checked_value, option, rule, shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.dataclass_json import from_json, to_json
-from hapticbridge.errors import HapticBridgeError
+from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.kernel.codes import Grip, Scheme, SchemeProperties
 from hapticbridge.kernel.pose import IDENTITY_POSE
 
@@ -189,9 +189,8 @@ def refuse_scene_ticks(scheme: int, ticks: int) -> None:
             "every one"
         )
     if scheme not in SLOW_SCHEMES:
-        raise HapticBridgeError(
-            "a scene slower than the loop needs method 'lossless', 'implicit' or 'compensated'"
-        )
+        names = choices(each.name for each in SLOW_SCHEMES)
+        raise HapticBridgeError(f"a scene slower than the loop needs one of the schemes {names}")
 
 
 SAME_AXES = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
