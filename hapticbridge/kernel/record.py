@@ -110,7 +110,8 @@ it. A recording of another format is refused, so other fields in any of them nee
 To add a field:
 
 1. here: the field in ``TICK_DTYPE``, 8 bytes wide, with a sentence below it; the next
-   ``FORMAT``; its unit in ``UNITS``, or for a vector its parts and unit in ``_PARTS``;
+   ``FORMAT``; its unit in ``UNITS``, or for a vector its parts and unit in ``_PARTS``. Without a
+   unit the import fails;
 2. in ``kernel.tick``: a line of ``_record`` that writes it, after the module that computes it has
    put it into the tick's state (``kernel.state`` has the table of writers). What the sample alone
    gives is written by ``_record_sample``;
@@ -155,6 +156,8 @@ _PARTS: dict[str, tuple[tuple[str, ...], str]] = {
     "wrench_on_device": _WRENCH,
 }
 UNITS = {
+    **dict.fromkeys(("tick", "flags", "buttons", "contacts", "solver_iterations"), "1"),
+    **dict.fromkeys(("lever", "scene_step"), "1"),
     "deadline_ns": "ns",
     "wake_ns": "ns",
     "read_ns": "ns",
@@ -192,7 +195,7 @@ class Column(NamedTuple):
 def _columns() -> Iterator[Column]:
     for field in TICK_DTYPE.names or ():
         if field not in _PARTS:
-            yield Column(field, field, None, UNITS.get(field, "1"))
+            yield Column(field, field, None, UNITS[field])
             continue
         parts, unit = _PARTS[field]
         for index, part in enumerate(parts):
