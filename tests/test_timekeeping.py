@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from audit_cases import AnsweringDevice, ScriptedDevice, SlowClock, recorded
+from audit_cases import AnsweringDevice, ScriptedDevice, SlowClock, recorded, stroke
 from bridge_runs import fast, sway
 from cli_cases import Called
 from numpy.typing import NDArray
@@ -105,11 +105,6 @@ class Case:
 
 def at_once(_tick: int) -> float:
     return 0.0
-
-
-def stroke(tick: int) -> tuple[float, ...]:
-    """A hand that swings by 25 mm, at most at 0.5 m/s, and presses the wall in its second stroke."""
-    return (0.025 * np.sin(0.02 * tick), 0, 0, 1, 0, 0, 0)
 
 
 STIFF = Coupling(3900.0, 1.95, 2.4, 1.7e-3)

@@ -19,7 +19,6 @@ from hapticbridge.audit.wrench_limits import AuditedBlock, axes_with_motor, whol
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import TickFlag, has_flag
 
-
 _LATE = 1.5  # time between two samples in T, above which the later one is late
 
 
@@ -113,46 +112,59 @@ class TimingTally:
             self.arrivals = np.concatenate([self.arrivals, sent["write_ns"] + delay])
             self.wrenches = np.concatenate([self.wrenches, sent["wrench_on_device"]])
             times = np.concatenate([[self.since], sent["read_ns"]])
+            lever = block.lever_before[first:end][chosen]
             found = np.diff(np.concatenate([[self.stored], stored[first:end][chosen]]))
-            steps[first + chosen] = found + self._given(times, rows[first + chosen], sent)
+            steps[first + chosen] = found + self._given(times, rows[first + chosen], sent, lever)
             if len(chosen):
                 self.since, self.stored = int(times[-1]), float(stored[first + chosen[-1]])
             last = max(int(np.searchsorted(self.arrivals, self.since, "right")) - 1, 0)
             self.arrivals, self.wrenches = self.arrivals[last:], self.wrenches[last:]
         steps[block.is_first] = 0.0
-        uncovered = _drained(steps, self.uncovered)
+        is_behind = parameters.guarding.stated_delay > 0.0
+        credit = parameters.guarding.energy_credit_limit if is_behind else 0.0
+        uncovered = _drained(steps, self.uncovered + credit) - credit
         self.uncovered = float(uncovered[-1])
-        if parameters.guarding.stated_delay > 0.0:
+        if is_behind:
             ratio = parameters.force_scale / parameters.scale
             uncovered = uncovered + ratio * np.maximum(ticks["environment_energy"], 0.0)
         self.max_uncovered = max(self.max_uncovered, float(np.max(uncovered)))
 
     def _given(
-        self, times: NDArray[np.int64], before: NDArray[np.void], samples: NDArray[np.void]
+        self,
+        times: NDArray[np.int64],
+        before: NDArray[np.void],
+        samples: NDArray[np.void],
+        lever: Array,
     ) -> Array:
-        """Returns E_k + u_k·δp_k of ``kernel.timing``, (n,) in J.
+        """Returns E_k + u'_k·δp_k of ``kernel.timing``, (n,) in J.
 
         Args:
             times: Times of the samples, and of the one before them, in ns.
             before: Records before each sample.
             samples: Their own records.
+            lever: r_{k−1}, (n,).
         """
-        guarding, origin, period = self.parameters.guarding, self.arrivals[0], self.parameters.period
+        parameters, origin = self.parameters, self.arrivals[0]
+        guarding = parameters.guarding
         ends = 1e-9 * (self.arrivals - origin)
         held = np.maximum(np.searchsorted(self.arrivals, times, "right") - 1, 0)
         since = (1e-9 * (times - origin) - ends[held])[:, None]
         time = 1e-9 * np.diff(times)[:, None]
-        is_late, time = time > _LATE * period, np.where(time > 0, time, np.inf)
+        is_late, time = time > _LATE * parameters.period, np.where(time > 0, time, np.inf)
         impulse, square = (
             np.diff(_integral(ends, values)[held] + since * values[held], axis=0)
             for values in (self.wrenches, self.wrenches**2)
         )
         moved = samples["device_position"] - before["device_position"]
         turned = turn_between(before["device_quaternion"], samples["device_quaternion"])
-        motion, sent = np.concatenate([moved, turned], axis=1), samples["wrench_on_device"]
+        motion = np.concatenate([moved, turned], axis=1)
+        whole = samples["lever"]
+        ratio = np.divide(lever, whole, out=np.zeros_like(whole), where=whole > 0)[:, None]
+        sent = ratio * samples["wrench_on_device"]
         b = np.repeat([guarding.assumed_damping, guarding.assumed_rotational_damping], 3)
         middle = np.where(is_late, impulse / time, sent)
-        unfelt = whole_wrench(samples, self.parameters) * (1.0 - axes_with_motor(self.parameters))
+        unfelt = ratio * whole_wrench(samples, parameters)
+        unfelt = unfelt * (1.0 - axes_with_motor(parameters))
         spread = np.maximum(square - 2 * middle * impulse + time * middle**2, 0.0)
         work = (middle + unfelt) * motion - np.where(is_late, b * motion**2 / time, 0.0)
         work += np.divide(spread, 4.0 * b, out=np.zeros_like(spread), where=b > 0)

@@ -518,7 +518,7 @@ def _lateness(s: State, kind: int, interval: float, ticks: int) -> float:
             pulled_on = rotation_between(quaternion_of(pose.tool_quaternion), turn)
         paid = needed * dot(pulled_on, pulled_on) / (ticks - 1)
         late += max(stiffness * dot(pulled_on, d) - paid, 0.0)
-    return late
+    return float(late)
 
 
 @compiled

@@ -251,7 +251,7 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
         max_stretch, max_twist = retune(s)
         s.loop.has_positions = 0  # it was computed with the old gains
     has_slipped = slip(s, max_stretch, max_twist)
-    note_motion(s, moved, turned, is_timed)
+    note_motion(s, moved, turned, lever, is_timed)
     if has_slipped and s.run.scheme == Scheme.MIDPOINT:
         note_slip(s)
     if has_slipped or (lever < 1.0 and (moved != _AT_REST or turned != _AT_REST)):

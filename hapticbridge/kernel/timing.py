@@ -5,28 +5,32 @@ its sample: the stated delay of the device t_d, 0 for one that answers within th
 samples come late or not at all, and a force is sent some time after its sample. So each run keeps
 the account by which the condition is proved, at the times that it had:
 
-    A_k = max(0, A_{k−1} + E_k + q Δ(W_c + V − V_0) + u_k·δp_k),    q = force_scale / scale
+    A_k = max(A_{k−1} + E_k + u'_k·δp_k + q Δ(W_c + V − V_0), −C),    q = force_scale / scale
 
 with the coupling's work on the scene W_c, the energy of its springs V, that at the start and after
 resets V_0, all in J after the tick, and the wrench u that axes without a motor would be sent. E_k
 is the most that the device gave to the hand since the last new sample. The hand moved by δp_k and
 felt the wrenches w(t), each from t_d after it was sent until the next one came. For any motion,
 
-    E_k = w_k·δp_k + ∫ ‖w(t) − w_k‖² dt/(4 b)
+    E_k = w'_k·δp_k + ∫ ‖w(t) − w'_k‖² dt/(4 b),    w' = w r_{k−1}/r_k
 
 and for the motion δp_k within the time τ, however it was spread, with the mean w̄ of w,
 
     E_k = w̄·δp_k − b ‖δp_k‖²/τ + ∫ ‖w(t) − w̄‖² dt/(4 b)
 
-which is never more. The first is taken, so that A holds what another hand could have had at the same
-forces. After a late sample it is the second: then the handle slips for the motion that there was
+which is never more. r is the lever: the handle moved by r_{k−1} times the device's motion. The
+first is taken, so that A holds what another hand could have had at the same forces. After a late
+sample it is the second: then the handle slips for the motion that there was
 (``law.charge_lateness``). In ticks without a new sample the device may have held the force of the
 last one, so that no other enters w.
 
+C is 0 for a device in time. Behind a delay it is the energy credit of the passivity controller:
+what wrenches on their way will cost, motion has paid for before.
+
 No property of the law is assumed: force level, slip, lever, changed gains, contacts, several hands
-and slower scenes are all in W_c and V. From any sample on, the hand gets at most A + q V, and what
-the scene had or created. In a strict scene with b >= N and constant times, A stays 0 up to what a
-few samples hold; see ``theory.bounds.late_minimum_damping``. What a scene within its slack created
+and slower scenes are all in W_c and V. From any sample on, the hand gets at most A + C + q V, and
+what the scene had or created. In a strict scene with b >= N and constant times, A stays near 0;
+see ``theory.bounds.late_minimum_damping``. What a scene within its slack created
 is added to A for a device that answers late: only the condition of a device in time pays for it.
 
 References:
@@ -64,6 +68,7 @@ TIMING_DTYPE = np.dtype(
         ("device_delay_ns", "<i8"),  # t_d in ns
         ("is_timed", "<i8"),  # 1 if the time since the last sample is known
         ("is_new", "<i8"),  # 1 if this tick's sample is new
+        ("lever", "<f8"),  # r_{k−1}/r_k of this tick
         ("moved", "<f8", 6),  # δp of this tick's sample in m and rad
         ("stored", "<f8"),  # q (W_c + V − V_0) in J after the tick of the last new sample
         ("newest", "<i8"),  # number of wrenches that were sent
@@ -82,16 +87,18 @@ TIMING_DTYPE = np.dtype(
 
 
 @compiled
-def note_motion(s: State, moved: Vector, turned: Vector, is_timed: bool) -> None:
+def note_motion(s: State, moved: Vector, turned: Vector, lever: float, is_timed: bool) -> None:
     """Notes the motion of a tick's sample.
 
     Args:
         s: The bound state.
         moved: Translation δp in m since the last tick, in the device's frame.
         turned: Its rotation vector in rad.
+        lever: r_{k−1}, of the wrench that was held until now.
         is_timed: True if the time is known that the motion took, and a law answers it.
     """
     t = s.timing
+    t.lever = lever / s.guard.lever if s.guard.lever > 0.0 else 0.0
     t.is_timed, t.is_new = is_timed, s.guard.consecutive_stale == 0
     store_vector(t.moved[:3], moved)
     store_vector(t.moved[3:], turned)
@@ -115,13 +122,13 @@ def _advance(t: Part, end: int) -> None:
 
 @compiled
 def _given(s: State, time: float, is_late: bool) -> float:
-    """Returns E_k + u_k·δp_k for a time τ in s."""
+    """Returns E_k + u'_k·δp_k for a time τ in s."""
     t, w, u, work = s.timing, s.loop.wrench_on_device, s.loop.unfelt, 0.0
     for i in range(6):
         b = s.observer.assumed_damping if i < 3 else s.observer.assumed_rotational_damping
         mean, d = t.impulse[i] / time, t.moved[i]
-        middle = mean if is_late else w[i]
-        work += (middle + u[i]) * d
+        middle = mean if is_late else t.lever * w[i]
+        work += (middle + t.lever * u[i]) * d
         if is_late:
             work -= b * d * d / time
         spread = t.square[i] - t.impulse[i] * mean + time * (mean - middle) ** 2
@@ -158,8 +165,12 @@ def note_delay(s: State, deadline_ns: int, read_ns: int, write_ns: int) -> None:
     t.lateness = lateness
     if not s.run.has_law:
         return
+    credit = created = 0.0
+    if t.device_delay_ns > 0:
+        credit = s.observer.energy_credit_limit
+        created = s.run.force_scale / s.run.scale * max(s.energy.environment_energy, 0.0)
     if not t.is_timed:  # the device held no force
-        t.held, t.now = t.newest, read_ns
+        t.held = t.newest
         for i in range(6):
             t.wrenches[t.held % RING][i] = 0.0
     elif t.is_new:
@@ -168,14 +179,11 @@ def note_delay(s: State, deadline_ns: int, read_ns: int, write_ns: int) -> None:
         stored, time = _stored(s), 1e-9 * (read_ns - t.since)
         if t.is_timed and time > 0.0:
             given = _given(s, time, time > LATE * s.run.period)
-            t.uncovered = max(t.uncovered + given + stored - t.stored, 0.0)
-        t.stored, t.since = stored, read_ns
+            t.uncovered = max(t.uncovered + given + stored - t.stored, -credit)
+        t.stored, t.since, t.now = stored, read_ns, read_ns
         t.newest += 1
         t.arrivals[t.newest % RING] = write_ns + t.device_delay_ns
         for i in range(6):
             t.impulse[i] = t.square[i] = 0.0
             t.wrenches[t.newest % RING][i] = w[i]
-    created = 0.0
-    if t.device_delay_ns > 0:
-        created = s.run.force_scale / s.run.scale * max(s.energy.environment_energy, 0.0)
     t.max_uncovered = max(t.max_uncovered, t.uncovered + created)
