@@ -639,20 +639,20 @@ SESSIONS = sorted(path.stem for path in (GOLDEN / "sessions").glob("*.txt"))
 _PROMPT = "$ hapticbridge "
 
 
-def recorded_classes(kind: Any, found: dict[type, None]) -> None:
+def recorded_classes(kind: Any, found: dict[Any, None]) -> None:
     """Adds the dataclasses that a type is made of, itself among them, to ``found``."""
     if kind in found:
         return
     if is_dataclass(kind):
-        found[kind] = None  # type: ignore[index]
-    parts = types_of(kind).values() if is_dataclass(kind) else get_args(kind)
+        found[kind] = None
+    parts = types_of(kind).values() if kind in found else get_args(kind)
     for part in (member for each in parts for member in members(each)):
         recorded_classes(part, found)
 
 
 def format_fields() -> str:
     """Returns the fields of request, parameters and tick by name, as a recording has them."""
-    found: dict[type, None] = {}
+    found: dict[Any, None] = {}
     recorded_classes(tuple[RunRequest, RunParameters], found)
     names = {each.__name__: sorted(own.name for own in fields(each)) for each in found}
     names["tick"] = [f"{name} {TICK_DTYPE[name]}" for name in TICK_DTYPE.names or ()]
