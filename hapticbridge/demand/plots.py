@@ -106,10 +106,11 @@ def alternatives(requested: Coupling, period: float, filter_time: float) -> tupl
         name = f"{method.name}: B = {shown.damping:.4g} effective (law {used.damping:.4g})"
         return way(name, law=used)
 
+    methods = list(map(by_method, guaranteed_methods().values()))
     frequency = _frequencies(period)
     line = transmission_line_spectrum(requested.stiffness * period, period, frequency)
     return (
-        *map(by_method, guaranteed_methods().values()),
+        *methods,
         way("B_law = B at half the period", step=period / 2),
         way(f"B_law = B, low-pass of {1e3 * filter_time:g} ms on it", low_pass=filter_time),
         way("B_law = B, Tustin's damper", scheme="tustin"),
