@@ -17,10 +17,10 @@ import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 from unittest.mock import patch
 
 import numpy as np
@@ -30,19 +30,25 @@ from model_runs import LOOP_SCENES
 from numpy.typing import NDArray
 
 import hapticbridge as hb
+from hapticbridge.arguments import members, types_of
 from hapticbridge.cli import main, terminal
 from hapticbridge.device import force_dimension
 from hapticbridge.device.touch import servo
 from hapticbridge.device.transport import hid, usb
 from hapticbridge.device.wheel.evdev import Linux
 from hapticbridge.errors import CommandError
-from hapticbridge.kernel.record import CLOCK_FIELDS
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.record import CLOCK_FIELDS, FORMAT, TICK_DTYPE
 from hapticbridge.recording import Recording
 from hapticbridge.run.commands import Command, Couple, Reset, Switch
 from hapticbridge.run.programs import prepare_run
+from hapticbridge.run.request import RunRequest
 
 GOLDEN = Path(__file__).parent / "golden"
 RUNS, AUDITS, MACHINE = (GOLDEN / f"{name}.json" for name in ("runs", "audits", "machine"))
+FORMAT_FIELDS = GOLDEN / f"format_{FORMAT}.txt"
+"""Fields that a recording of this format has. The file of a format is written once: other fields
+need the next ``FORMAT`` in ``kernel.record``."""
 
 Pose = tuple[float, ...]
 Json = dict[str, Any]
@@ -631,6 +637,26 @@ SESSIONS = sorted(path.stem for path in (GOLDEN / "sessions").glob("*.txt"))
 """Names of the golden sessions: commands in order, what they print, and their exit codes."""
 
 _PROMPT = "$ hapticbridge "
+
+
+def recorded_classes(kind: Any, found: dict[Any, None]) -> None:
+    """Adds the dataclasses that a type is made of, itself among them, to ``found``."""
+    if kind in found:
+        return
+    if is_dataclass(kind):
+        found[kind] = None
+    parts = types_of(kind).values() if kind in found else get_args(kind)
+    for part in (member for each in parts for member in members(each)):
+        recorded_classes(part, found)
+
+
+def format_fields() -> str:
+    """Returns the fields of request, parameters and tick by name, as a recording has them."""
+    found: dict[Any, None] = {}
+    recorded_classes(tuple[RunRequest, RunParameters], found)
+    names = {each.__name__: sorted(own.name for own in fields(each)) for each in found}
+    names["tick"] = [f"{name} {TICK_DTYPE[name]}" for name in TICK_DTYPE.names or ()]
+    return "".join("\n    ".join([kind, *own]) + "\n" for kind, own in sorted(names.items()))
 
 
 def session_file(name: str) -> Path:

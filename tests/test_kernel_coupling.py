@@ -33,19 +33,25 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.audit import spring as audit_spring
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import (
     Spring,
     energy_at_level,
     is_bent,
+    is_beyond_level,
     is_straight,
     length_at,
     limited,
     next_gain_ratio,
+    secant_stiffness,
     spring_energy,
     spring_length,
 )
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.pose import IDENTITY_POSE
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.tick import after_step, before_step
+from hapticbridge.scene import rehearsal
 
 MASS = 0.1
 STIFF = Coupling(2000.0, 2.0, 2.0, 2e-3)
@@ -207,8 +213,14 @@ def test_energy_and_length_of_a_spring_follow_from_its_force() -> None:
         assert spring_energy(SPRING, length) == pytest.approx(energy, rel=1e-6, abs=1e-15)
         assert spring_length(SPRING, spring_energy(SPRING, length)) == pytest.approx(length)
     assert _force(length_at(SPRING, 1.7)) == pytest.approx(1.7)
+    assert secant_stiffness(SPRING, 1.7) * length_at(SPRING, 1.7) == pytest.approx(1.7)
     at_level = spring_energy(SPRING, length_at(SPRING, SPRING.level))
     assert energy_at_level(SPRING) == pytest.approx(at_level)
+
+
+def test_a_spring_is_beyond_its_level_where_the_linear_law_asks_for_more() -> None:
+    sizes = SPRING.stiffness * LENGTHS
+    assert [is_beyond_level(SPRING, size) for size in sizes] == list(sizes > SPRING.level)
 
 
 def test_a_spring_is_bent_where_its_force_is_not_that_of_the_linear_law() -> None:
@@ -241,3 +253,53 @@ def test_the_audits_spring_is_the_kernels() -> None:
     sizes = np.linalg.norm(u, axis=1)
     straight = [is_straight(SPRING, size, 0.5) for size in sizes]
     assert twin.is_straight(sizes, np.full(len(sizes), 0.5)).tolist() == straight
+
+
+SCALED = RunParameters(
+    grip="grip",
+    period=T,
+    substeps=1,
+    coupling=STIFF,
+    scale=1.5,
+    force_scale=0.7,
+    force_limit=4.0,
+    torque_limit=0.3,
+    ramp_ticks=0,
+    device_origin=IDENTITY_POSE,
+    handle_origin=IDENTITY_POSE,
+    device_start=IDENTITY_POSE,
+)
+"""Parameters of a run whose device feels a part of the tool's forces."""
+
+
+def test_the_levels_on_the_tool_are_the_devices_limits_and_those_of_the_audit() -> None:
+    force, torque = SCALED.levels_on_tool
+    assert 0.7 * force == pytest.approx(4.0)
+    assert 0.7 / 1.5 * torque == pytest.approx(0.3)
+    assert audit_spring.levels_on_tool(SCALED) == SCALED.levels_on_tool
+
+
+@compiled
+def softened(spring: Spring, force: float) -> float:
+    return spring.stiffness / (1.0 + force)
+
+
+def test_the_handle_starts_where_the_law_carries_the_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    tool = (0.1, 0.2, 0.3, 0.8, 0.6, 0.0, 0.0)
+    load = np.array([1.0, -2.0, 3.0, 0.1, 0.05, -0.1])
+
+    def stretch_and_twist() -> tuple[Array, Array]:
+        handle = rehearsal.loaded_handle(tool, load, SCALED)
+        turn = Rotation.from_quat(handle[3:], scalar_first=True)
+        turn *= Rotation.from_quat(tool[3:], scalar_first=True).inv()
+        return np.subtract([handle[:3]], tool[:3]), turn.as_rotvec()[None]
+
+    gains = np.array([[STIFF.stiffness, 0.0, STIFF.rotational_stiffness, 0.0]])
+    stretch, twist = stretch_and_twist()
+    linear, angular = audit_spring.springs(gains, SCALED)
+    assert linear.force(stretch)[0] == pytest.approx(load[:3])
+    assert angular.force(twist)[0] == pytest.approx(load[3:])
+    monkeypatch.setattr(rehearsal, "secant_stiffness", softened)
+    softer, more = stretch_and_twist()
+    assert softer == pytest.approx((1.0 + np.linalg.norm(load[:3])) * stretch)
+    assert more == pytest.approx((1.0 + np.linalg.norm(load[3:])) * twist)

@@ -337,7 +337,7 @@ def test_a_slower_scene_needs_a_method_that_solves_its_coupling() -> None:
     assert parameters.of_scene.period == parameters.scene_period
     assert parameters.of_scene.scene_ticks == 0
     refused: tuple[tuple[dict[str, Any], str], ...] = (
-        ({"scheme": 2}, "needs method 'lossless', 'implicit' or 'compensated'"),
+        ({"scheme": 2}, "needs one of the schemes 'IMPLICIT', 'MIDPOINT'"),
         ({"scene_ticks": 1}, "once in 1 ticks; it must be 2 to 1000"),
         ({"scene_ticks": 1001}, "it must be 2 to 1000"),
     )

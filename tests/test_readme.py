@@ -126,6 +126,7 @@ def test_links_and_pictures_exist() -> None:
 
 
 def test_readme_is_short() -> None:
+    """The rows of tables do not count: a new device adds one."""
     lines = README.splitlines()
-    assert len(lines) <= 150
+    assert sum(not line.startswith("|") for line in lines) <= 122
     assert max(map(len, lines)) <= 110

@@ -243,10 +243,12 @@ def test_recording_without_a_tick_is_whole(tmp_path: Path) -> None:
     assert recording.problems == ()
 
 
-def mcap_with(topic: str, schema: str, text: bytes) -> bytes:
+def mcap_with(topic: str, schema: str, text: bytes, **meta: str) -> bytes:
     stream = io.BytesIO()
     writer = Writer(stream)
     writer.start()
+    if meta:
+        writer.add_metadata("hapticbridge", meta)
     channel = writer.register_channel(topic, "cdr", writer.register_schema(schema, "ros2msg", text))
     writer.add_message(channel, 0, b"\x00\x01\x00\x00", 0)
     writer.finish()  # type: ignore[no-untyped-call]
@@ -261,6 +263,7 @@ def mcap_with(topic: str, schema: str, text: bytes) -> bytes:
         (mcap_with("/imu", "sensor_msgs/msg/Imu", b"int64 a"), "no topic /tick"),
         (mcap_with("/tick", "other/msg/Tick", b"int64 a"), "has the schema 'other/msg/Tick'"),
         (mcap_with("/tick", "hapticbridge/msg/Tick", b"int64 tick"), "has other fields"),
+        (mcap_with("/tick", "hapticbridge/msg/Tick", b"int64 tick", format="0"), "format '0'"),
     ],
 )
 def test_file_no_recording_is_refused(tmp_path: Path, content: bytes, reason: str) -> None:

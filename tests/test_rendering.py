@@ -43,14 +43,14 @@ from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome, Timing
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.recording import read_recording
 from hapticbridge.run.bridge import Bridge
-from hapticbridge.run.options import Workspace
+from hapticbridge.run.options import BridgeOptions, Workspace
 from hapticbridge.scene import load_scene
 from hapticbridge.theory.rigid_body import exact_mass_response
 from hapticbridge.theory.sampled_loop import WorstHand
 
 HAZARDOUS = [name for name in METHODS if METHODS[name].hazard]
 MOVED_BY = SERVO.replace("{mocap}", "false").replace("{actuator}", "{}")
-PROVEN = ("implicit", "compensated", "lossless")
+PROVEN = [name for name in METHODS if METHODS[name].has_guarantee]
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -104,9 +104,13 @@ def test_on_a_real_device_only_what_is_proven_goes_unasked(name: str) -> None:
         Bridge("point_mass", Rotor(is_real=True), COUPLING, method=name)
     assert METHODS[name].hazard in str(caught.value)
     Bridge("point_mass", Rotor(is_real=True), COUPLING, method=name, i_know=True)
-    assert name not in PROVEN
     for proven in PROVEN:
         Bridge("point_mass", Rotor(is_real=True), COUPLING, method=proven)
+
+
+def test_the_help_of_the_option_describes_every_method_with_a_guarantee() -> None:
+    about = str(BridgeOptions.__doc__).partition("method: ")[2].partition("contact: ")[0]
+    assert [name for name in PROVEN if f"'{name}'" not in about] == []
 
 
 NO_EQUALITY = '<option><flag equality="disable"/></option></mujoco>'

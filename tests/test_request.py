@@ -9,6 +9,7 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import golden_cases as golden
 import mujoco
 import pytest
 from audit_cases import ScriptedDevice, other_request, rewritten
@@ -185,6 +186,11 @@ def test_the_runs_choose_a_value_for_every_field(tmp_path: Path) -> None:
     found = {each for make in RUNS.values() for each in chosen(make(tmp_path / "run.mcap").request)}
     every = {(kind.__name__, each.name) for kind in OPTION_CLASSES for each in fields(kind)}
     assert every - found - NOT_RECORDED == set()
+
+
+def test_other_fields_of_a_recording_need_another_format() -> None:
+    """A changed field fails here until ``kernel.record.FORMAT`` is the next; then freeze."""
+    assert golden.format_fields() == golden.FORMAT_FIELDS.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", RUNS)

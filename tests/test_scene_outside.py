@@ -368,7 +368,7 @@ def test_handle_starts_at_grip_of_a_robot_that_falls_beside_it(tmp_path: Path) -
         assert np.linalg.norm(load[:3]) == pytest.approx(2.1 * 9.81, rel=0.02)
         bridge.run(duration=0.05)
         # that load would throw the light end of the leg
-        loaded = loaded_handle(bridge.scene.grip_pose(), load, parameters.coupling)
+        loaded = loaded_handle(bridge.scene.grip_pose(), load, parameters)
         assert loaded[2] - bridge.scene.grip_pose()[2] > 5e-3
         assert np.linalg.norm(bridge.latest_records(1)["wrench_on_tool"][0, :3]) < 10.0
 

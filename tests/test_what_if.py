@@ -32,7 +32,7 @@ from hapticbridge.run.description import SOURCE_PREFIX
 from hapticbridge.run.options import Workspace
 from hapticbridge.scene import load_scene
 from hapticbridge.units import format_si
-from hapticbridge.whatif import WhatIf, WhatIfRun, write_what_if
+from hapticbridge.whatif import WhatIf, WhatIfRun, changes_from, write_what_if
 from hapticbridge.whatif import what_if as confined_what_if
 from hapticbridge.whatif.recorded import RecordedRun
 from hapticbridge.whatif.replayed_hand import Repetition, intended
@@ -410,6 +410,18 @@ def test_the_page_of_a_run_made_active_has_a_likely_cause_for_each(tmp_path: Pat
     for run in found.runs:
         is_active = run.report.verdict == "active"
         assert (f"<h2>The moment ({run.name})</h2>" in text) is is_active
+
+
+def test_a_setting_may_have_the_dashes_of_its_flag() -> None:
+    words = "rotational-stiffness=2", "left-grip:force-scale=0.5", "peg-mass=1", "rate=500"
+    assert changes_from(words) == [
+        {
+            "rotational_stiffness": "2",
+            "left-grip:force_scale": "0.5",
+            "peg-mass": "1",
+            "rate": "500",
+        }
+    ]
 
 
 def test_several_values_of_a_setting_stand_side_by_side(wall: Path, call: Called) -> None:

@@ -1,5 +1,8 @@
 """Second computation of the coupling's springs, the twin of ``Spring`` in ``kernel.law``.
 
+It imports nothing of the law on purpose: a fault there must not appear on both sides. Its force
+levels are a second computation, too, of ``RunParameters.levels_on_tool``.
+
 With u = K e + (B'/T) δe the wrench on the tool is g(‖u‖) u/‖u‖, and g(u) = min(u, F). All functions
 take one number or vector per record.
 """
@@ -16,7 +19,7 @@ from hapticbridge.kernel.parameters import RunParameters
 Array = NDArray[np.float64]
 
 
-def limits_on_tool(parameters: RunParameters) -> tuple[float, float]:
+def levels_on_tool(parameters: RunParameters) -> tuple[float, float]:
     """Returns force and torque on the tool at the device's limits, in N and N m."""
     return (
         parameters.force_limit / parameters.force_scale,
@@ -67,5 +70,5 @@ class Spring:
 
 def springs(gains: Array, parameters: RunParameters) -> tuple[Spring, Spring]:
     """Returns the springs for translation and rotation; ``gains`` is K, B', K_r, B'_r, (n, 4)."""
-    force, torque = limits_on_tool(parameters)
+    force, torque = levels_on_tool(parameters)
     return Spring(gains[:, 0], force), Spring(gains[:, 2], torque)

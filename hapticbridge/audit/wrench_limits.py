@@ -28,7 +28,7 @@ from hapticbridge.audit.motion import (
     turn_between,
     wrench_by_law,
 )
-from hapticbridge.audit.spring import limits_on_tool, shortened, springs
+from hapticbridge.audit.spring import levels_on_tool, shortened, springs
 from hapticbridge.audit.structure import TOLERANCE, Deviation, is_let_go, may_fade
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import UNITS, TickFlag, has_flag
@@ -214,7 +214,7 @@ def whole_wrench(ticks: NDArray[np.void], parameters: RunParameters) -> Array:
     axes = np.array(parameters.axes).reshape(3, 3)
     on_tool = ticks["wrench_on_tool"].copy()
     if not parameters.has_law:  # a law limits it on the tool too
-        for part, limit in zip((_FORCE, _TORQUE), limits_on_tool(parameters), strict=True):
+        for part, limit in zip((_FORCE, _TORQUE), levels_on_tool(parameters), strict=True):
             on_tool[:, part] = shortened(on_tool[:, part], limit)
     wrench = -parameters.force_scale * ticks["lever"][:, None] * on_tool
     return np.concatenate(

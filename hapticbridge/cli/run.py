@@ -26,7 +26,7 @@ from hapticbridge.demand.certificate import (
 )
 from hapticbridge.demand.guard import refuse_simulated_time
 from hapticbridge.demand.loop_setting import device_period
-from hapticbridge.demand.methods import RunCoupling, default_method
+from hapticbridge.demand.methods import RunCoupling, default_method, unsuited_reason
 from hapticbridge.demand.rehearsal import Setting
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.base import checked_close
@@ -72,7 +72,7 @@ def announce(setup: RunSetup, given: Mapping[str, float], *, is_method_chosen: b
     ``given`` has the gains of the coupling that the user named, ``is_method_chosen`` is true if
     they named the method.
     """
-    method, substeps = setup.method, setup.substeps
+    method = setup.method
     scene, device = escape(setup.scene.name), escape(setup.info.name)
     at = f" at '{escape(setup.scene.grip)}'" if setup.scene.has_several_hands else ""
     err.print(
@@ -94,8 +94,8 @@ def announce(setup: RunSetup, given: Mapping[str, float], *, is_method_chosen: b
     if is_method_chosen and method.name != usual.name:
         err.print(f"  {method.name}: {escape(method.about)}")
     elif method.name != usual.name and setup.scene.hand == 0:
-        lacking = f"takes one MuJoCo step a tick, and this run {substeps}"
-        reason = "has one hand, without a grip axis" if setup.scene.has_several_hands else lacking
+        has_several = setup.scene.has_several_hands
+        reason = unsuited_reason(usual, setup.substeps, has_several_hands=has_several)
         err.print(f"  {method.name}, because {usual.name} {reason}")
     if method.hazard:
         err.print(f"[yellow]warning:[/yellow] {escape(method.hazard)}")

@@ -124,6 +124,24 @@ class Method:
         """True if the scene can step in a slower loop than the bridge's (``slow_scene``)."""
         return self.scheme in SLOW_SCHEMES
 
+    def refuse_slow(self) -> None:
+        """Refuses a scene that steps in a slower loop, for a method that cannot have one.
+
+        Raises:
+            HapticBridgeError: The message lists the methods with a guarantee that can.
+        """
+        if not self.can_be_slow:
+            able = [name for name, each in guaranteed_methods().items() if each.can_be_slow]
+            raise HapticBridgeError(
+                f"method '{self.name}' has no scene slower than the loop; take one of "
+                f"{choices(able)}"
+            )
+
+    @property
+    def has_guarantee(self) -> bool:
+        """True if nothing beyond the device condition may make it kick on a real device."""
+        return not self.hazard
+
     @property
     def contact(self) -> Contact:
         """Contact by its name in ``CONTACTS``."""
@@ -406,12 +424,28 @@ COMPARISONS = "hapticbridge.lab.methods"
 """Module of the methods that exist only to be compared; it registers them in ``METHODS``."""
 
 
-def default_method(substeps: int = 1) -> Method:
-    """Returns the default method: ``lossless`` with one MuJoCo step per tick, else ``implicit``.
+def guaranteed_methods() -> dict[str, Method]:
+    """Returns the methods with a guarantee by name, the default one first and the newest next."""
+    methods = dict.fromkeys((default_method(), *reversed(METHODS.values())))
+    return {method.name: method for method in methods if method.has_guarantee}
 
-    ``lossless`` takes no substeps. It is strict on every shipped scene, in 20 hands each. Away from
-    contact it is at least ten times as accurate as ``implicit``; in contact it equals ``implicit``
-    with the same B', and so suits the same device.
+
+def unsuited_reason(method: Method, substeps: int, *, has_several_hands: bool) -> str:
+    """Returns why a method cannot render a run, as a clause; empty if it can."""
+    properties = method.scheme.properties
+    if has_several_hands and not properties.allows_hands:
+        return "has one hand, without a grip axis"
+    if substeps != 1 and properties.one_substep:
+        return f"takes one MuJoCo step a tick, and this run {substeps}"
+    return ""
+
+
+def default_method(substeps: int = 1, *, has_several_hands: bool = False) -> Method:
+    """Returns the default method: ``lossless`` if it suits the run, else ``implicit``.
+
+    ``lossless`` takes no substeps and has one hand (``unsuited_reason``). It is strict on every
+    shipped scene, in 20 hands each. Away from contact it is at least ten times as accurate as
+    ``implicit``; in contact it equals ``implicit`` with the same B', and so suits the same device.
 
     Springs and dampers of the tool's joints and tendons are taken at the midpoint as well. A mass
     of 1 kg on 500 N/m errs by 0.011 % at 1 ms, by 0.10 % with a held force, by 1.3 % with
@@ -426,7 +460,8 @@ def default_method(substeps: int = 1) -> Method:
     reported effective coupling. ``implicit`` is 26 µm off its own report, B + K T/2, and 116 µm off
     B.
     """
-    return LOSSLESS_COUPLING if substeps == 1 else IMPLICIT
+    reason = unsuited_reason(LOSSLESS_COUPLING, substeps, has_several_hands=has_several_hands)
+    return IMPLICIT if reason else LOSSLESS_COUPLING
 
 
 def method_names() -> tuple[str, ...]:

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import (
-    COMPENSATED,
-    IMPLICIT,
     Method,
     RunCoupling,
     default_method,
+    guaranteed_methods,
 )
 from hapticbridge.plotting import new_figure
 from hapticbridge.theory.bounds import late_minimum_damping, minimum_damping, worst_frequency
@@ -107,9 +106,7 @@ def alternatives(requested: Coupling, period: float, filter_time: float) -> tupl
         name = f"{method.name}: B = {shown.damping:.4g} effective (law {used.damping:.4g})"
         return way(name, law=used)
 
-    methods = [
-        by_method(method) for method in dict.fromkeys((default_method(), COMPENSATED, IMPLICIT))
-    ]
+    methods = list(map(by_method, guaranteed_methods().values()))
     frequency = _frequencies(period)
     line = transmission_line_spectrum(requested.stiffness * period, period, frequency)
     return (

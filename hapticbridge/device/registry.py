@@ -8,8 +8,9 @@ To add a driver to this tree (``hapticbridge guide device-package`` adds one fro
 2. A row in ``DRIVERS``: its name and its module.
 3. A profile in ``device/profiles`` for each model with measured or stated numbers.
 4. A row in README's table of devices, and a section in ``guide/devices.md``.
-5. Tests: an emulated unit in ``tests/emulated``, the contract suite
+5. Tests: an emulated unit in ``tests/emulated``, its entry in ``DEVICES`` of the contract suite
    (``tests/test_device_contract.py``), and ``tests/test_device_NAME.py`` for its own protocol.
+6. ``scripts/freeze``: the printed lists of devices have the new name.
 """
 
 from __future__ import annotations

@@ -37,6 +37,7 @@ from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import (
     applied_wrench,
     is_bent,
+    is_beyond_level,
     law_wrench,
     limited,
     next_gain_ratio,
@@ -159,7 +160,8 @@ def limited_wrench(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vec
     """
     linear, angular = springs(s)
     new, new_torque = limited(linear, force), limited(angular, torque)
-    s.level.flags = FORCE_LIMITED if _is_bent(s, force, torque) else 0
+    is_limited = is_beyond_level(linear, norm(force)) or is_beyond_level(angular, norm(torque))
+    s.level.flags = FORCE_LIMITED if is_limited else 0
     return new, new_torque
 
 

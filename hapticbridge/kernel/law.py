@@ -168,8 +168,9 @@ def set_tuning_goal(
 #
 # The wrench on the tool is g(‖u‖) u/‖u‖ with u = K e + (B'/T) δe, on the tool and on the device
 # alike. g is the curve of the spring, here min(‖u‖, F). Any curve whose slope is from 0 to 1 keeps
-# the device condition (``force_level``). Another law changes the functions of this section, and
-# their twin in ``audit.spring``.
+# the device condition (``force_level``), and c = g(‖u‖)/‖u‖ must stay above 0, because the step's
+# solution is divided by it. Another law changes the functions of this section, and their twin in
+# ``audit.spring``.
 
 
 class Spring(NamedTuple):
@@ -194,6 +195,12 @@ def springs(s: State) -> tuple[Spring, Spring]:
 @compiled
 def is_bent(spring: Spring, size: float) -> bool:
     """Returns True if the curve changes a force of the linear law, g(‖u‖) < ‖u‖."""
+    return size > spring.level
+
+
+@compiled
+def is_beyond_level(spring: Spring, size: float) -> bool:
+    """Returns True if the linear law asks for more than the level, so that the record tells it."""
     return size > spring.level
 
 
@@ -227,9 +234,15 @@ def next_gain_ratio(spring: Spring, size: float, share: float, compliance: float
 
 
 @compiled
+def secant_stiffness(spring: Spring, _force: float) -> float:
+    """Returns force over length in N/m or N m/rad at a force up to the level; K without a force."""
+    return spring.stiffness
+
+
+@compiled
 def length_at(spring: Spring, force: float) -> float:
     """Returns the length at which a spring of a stiffness above 0 has a force up to its level."""
-    return force / spring.stiffness
+    return force / secant_stiffness(spring, force)
 
 
 @compiled

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from hapticbridge.arguments import Rule, check_fields, checked_value, option, rule, shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.dataclass_json import from_json, to_json
-from hapticbridge.errors import HapticBridgeError
+from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.kernel.codes import Grip, Scheme, SchemeProperties
 from hapticbridge.kernel.pose import IDENTITY_POSE
 
@@ -189,9 +189,8 @@ def refuse_scene_ticks(scheme: int, ticks: int) -> None:
             "every one"
         )
     if scheme not in SLOW_SCHEMES:
-        raise HapticBridgeError(
-            "a scene slower than the loop needs method 'lossless', 'implicit' or 'compensated'"
-        )
+        names = choices(each.name for each in SLOW_SCHEMES)
+        raise HapticBridgeError(f"a scene slower than the loop needs one of the schemes {names}")
 
 
 SAME_AXES = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -303,6 +302,14 @@ class RunParameters:
         return Grip.from_text(self.grip).is_joint
 
     @property
+    def levels_on_tool(self) -> tuple[float, float]:
+        """Force level F in N and F_r in N m on the tool, from the limits on the device."""
+        return (
+            self.force_limit / self.force_scale,
+            self.torque_limit * self.scale / self.force_scale,
+        )
+
+    @property
     def tank_cap(self) -> float:
         """Largest energy in J that may pay for the depenetration of rigid contacts, ½ K c²."""
         return 0.5 * self.coupling.stiffness * TANK_STRETCH**2
@@ -310,6 +317,7 @@ class RunParameters:
     @property
     def of_scene(self) -> RunParameters:
         """Parameters of a slower scene's own loop; its device is the handle."""
+        force_limit, torque_limit = self.levels_on_tool
         return replace(
             self,
             period=self.scene_period,
@@ -318,8 +326,8 @@ class RunParameters:
             scale=1.0,
             force_scale=1.0,
             axes=SAME_AXES,
-            force_limit=self.force_limit / self.force_scale,
-            torque_limit=self.torque_limit * self.scale / self.force_scale,
+            force_limit=force_limit,
+            torque_limit=torque_limit,
             ramp_ticks=0,
             device_origin=IDENTITY_POSE,
             handle_origin=IDENTITY_POSE,

@@ -104,13 +104,14 @@ than the loop, and ``scene_tank`` is the energy in J that the hand has given and
 yet got; both are 0 for a scene that steps in every tick (``kernel.shown_tool``)."""
 
 FORMAT = "1"
-"""Format of a recording: its fields, and its metadata with the numbers that follow from a request.
-A recording of another format is refused.
+"""Format of a recording: its fields, the request with its options, and the numbers that follow from
+it. A recording of another format is refused, so other fields in any of them need the next number.
 
 To add a field:
 
 1. here: the field in ``TICK_DTYPE``, 8 bytes wide, with a sentence below it; the next
-   ``FORMAT``; its unit in ``UNITS``, or for a vector its parts and unit in ``_PARTS``;
+   ``FORMAT``; its unit in ``UNITS``, or for a vector its parts and unit in ``_PARTS``. Without a
+   unit the import fails;
 2. in ``kernel.tick``: a line of ``_record`` that writes it, after the module that computes it has
    put it into the tick's state (``kernel.state`` has the table of writers). What the sample alone
    gives is written by ``_record_sample``;
@@ -155,6 +156,8 @@ _PARTS: dict[str, tuple[tuple[str, ...], str]] = {
     "wrench_on_device": _WRENCH,
 }
 UNITS = {
+    **dict.fromkeys(("tick", "flags", "buttons", "contacts", "solver_iterations"), "1"),
+    **dict.fromkeys(("lever", "scene_step"), "1"),
     "deadline_ns": "ns",
     "wake_ns": "ns",
     "read_ns": "ns",
@@ -192,7 +195,7 @@ class Column(NamedTuple):
 def _columns() -> Iterator[Column]:
     for field in TICK_DTYPE.names or ():
         if field not in _PARTS:
-            yield Column(field, field, None, UNITS.get(field, "1"))
+            yield Column(field, field, None, UNITS[field])
             continue
         parts, unit = _PARTS[field]
         for index, part in enumerate(parts):

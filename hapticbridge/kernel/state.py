@@ -391,10 +391,7 @@ class BoundKernel:
         self._owned |= bind_level(
             s["level"],
             self._model,
-            (
-                parameters.force_limit / parameters.force_scale,
-                parameters.torque_limit * parameters.scale / parameters.force_scale,
-            ),
+            parameters.levels_on_tool,
             is_solved=not parameters.scene_ticks
             and parameters.scheme in (Scheme.IMPLICIT, Scheme.MIDPOINT)
             and self._model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE,

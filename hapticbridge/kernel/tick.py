@@ -8,7 +8,15 @@
     5. the wrench is sent                 5.   no device,
     6. finish_tick: close_tick, publish   6.   close_tick
 
-2 to 4 are repeated for each substep. Both inline the same functions and agree to the bit.
+2 to 4 are repeated for each substep. Both inline the same functions and agree to the bit. The end
+of a tick has five functions:
+
+    function          called by                                  does
+    answer_step       live loop, after_step                      wrenches of a step
+    finish_tick       live loop, when the wrench was sent        close_tick, publish
+    close_tick        finish_tick, after_step, last substep      balance of all hands
+    complete_record   close_tick, for each hand                  peaks, record, count
+    publish           finish_tick; live loop if ring was full    records to the ring
 
 Each hand has a state of its own (``state.STATE_DTYPE``): device, handle, coupling, force level,
 guard and account. All states are bound to one model and its data; the first one meters the scene,
@@ -611,7 +619,7 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
     if has_positions and not is_sound(s):
         loop.has_positions = 0
     for i in range(state.size):
-        end_tick(state[i], row[i])
+        complete_record(state[i], row[i])
         row[i].contact_tank = row[0].contact_tank
     if loop.has_positions and turns_actuators_alone(s):
         take_velocities(s)
@@ -619,7 +627,7 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
 
 
 @compiled
-def end_tick(s: State, row: State) -> None:
+def complete_record(s: State, row: State) -> None:
     """Notes the peaks, completes the record, and counts the tick."""
     loop = s.loop
     loop.peak_force = max(loop.peak_force, norm(vector_of(loop.wrench_on_device)))

@@ -481,6 +481,8 @@ def _read_through(
             runs.clear()
 
     *_, (container, contents) = _read_parts(path, take)
+    if contents.meta is not None:  # before its fields, which another format explains
+        layout.refuse_format(path, contents.meta)
     if not contents.has_ticks:
         # a file cut inside its first chunk has no schema yet, but has metadata
         if contents.refusal or contents.meta is None or not container.is_cut:
@@ -488,8 +490,6 @@ def _read_through(
             raise RecordingError(f"{path} is not a recording that can be read: {reason}")
     elif contents.meta is None:
         contents.problems.append(f"the metadata record '{layout.METADATA_NAME}' is missing")
-    else:
-        layout.refuse_format(path, contents.meta)
     meta = contents.meta or {}
     hands = _hands_in(path, meta, hand, contents.problems)
     if any(counts[hands:]) or (not container.is_cut and len(set(counts[:hands])) > 1):

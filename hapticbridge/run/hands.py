@@ -19,7 +19,7 @@ from hapticbridge.arguments import check_fields, option, rule, shared
 from hapticbridge.clock import Clock
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import Limits
-from hapticbridge.demand.methods import METHODS, method_named
+from hapticbridge.demand.methods import METHODS, default_method, method_named
 from hapticbridge.device import Device, DeviceInfo
 from hapticbridge.device.base import checked_close, checked_read, checked_start, checked_write
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
@@ -193,13 +193,13 @@ def resolve_hands(
 ) -> tuple[RunSetup, ...]:
     """Returns the setup of each hand; its own choices replace those of the options.
 
-    A grip axis is a hand of its own. The method is ``implicit`` unless it is named.
+    A grip axis is a hand of its own.
 
     Raises:
         HapticBridgeError: As for ``RunSetup.resolve``, or a choice does not suit several hands.
     """
     if options.method is None:
-        options = replace(options, method="implicit")
+        options = replace(options, method=default_method(has_several_hands=True).name)
     _refuse_unsuited(options)
     common = replace(options, scene_rate=options.rate, pipelined=False)
     setups: list[RunSetup] = []

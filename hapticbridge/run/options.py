@@ -55,7 +55,6 @@ from hapticbridge.kernel.parameters import (
     UNGUARDED,
     GuardParameters,
     RunParameters,
-    refuse_scene_ticks,
     refuse_substeps,
     rotation_numbers,
 )
@@ -152,7 +151,8 @@ class BridgeOptions:
             for comparison have them.
         contact_stiffness: Stiffness per contact of method 'direct'; by default that of the
             coupling.
-        i_know: Accept a method that may kick on a real device. The first three never need it.
+        i_know: Accept a method that may kick on a real device. A method with a guarantee never
+            needs it.
         workspace: Map from the device's frame to the scene's.
         limits: Limits of the wrench and of the run.
         controller: Passivity controller, damping added against energy that came from nowhere.
@@ -198,8 +198,8 @@ class BridgeOptions:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.scene_rate != AUTO:
-            refuse_scene_ticks(self.rendering_method.scheme, self.scene_ticks)
+        if self.scene_ticks:
+            self.rendering_method.refuse_slow()
         refuse_substeps(self.rendering_method.scheme, self.substeps or 1)
         if self.clutch is not None and self.clutch == self.dead_man:
             raise DeviceError(
@@ -543,7 +543,7 @@ class RunSetup:
 
     def overload(self, parameters: RunParameters) -> str:
         """Returns why the device cannot hold the tool, as a clause; empty if it can."""
-        scene, most = self.scene, self.limits.force
+        scene, most = self.scene, self._sent(parameters.levels_on_tool[0])
         if not self.method.has_law or self.info.is_prescribed or scene.is_carried:
             return ""
         if (force := self._sent(holding_force(scene, parameters))) > most:

@@ -15,7 +15,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import (
     WARNINGS,
@@ -26,7 +25,8 @@ from hapticbridge.kernel.codes import (
     held_body,
     warning_words,
 )
-from hapticbridge.kernel.jit import direct
+from hapticbridge.kernel.jit import direct, source_of
+from hapticbridge.kernel.law import Spring, secant_stiffness
 from hapticbridge.kernel.lossless import tree_of_tool
 from hapticbridge.kernel.mujoco_c import quiet, warning_at
 from hapticbridge.kernel.parameters import RunParameters
@@ -218,11 +218,9 @@ def start_handle(
         load: Result of ``static_load``.
     """
     coupling, grip = parameters.coupling, scene.grip_pose()
-    levels = np.array([parameters.force_limit, parameters.torque_limit * parameters.scale])
-    sizes = np.linalg.norm(load.reshape(2, 3), axis=1) * parameters.force_scale
-    shares = np.minimum(levels / np.maximum(sizes, levels), 1.0)
-    carried = load * np.repeat(shares, 3)
-    poses = loaded_handle(grip, carried, coupling), grip
+    levels = np.array(parameters.levels_on_tool)
+    carried = load * np.repeat(levels / np.maximum(_sizes(load), levels), 3)
+    poses = loaded_handle(grip, carried, parameters), grip
     if poses[0] == grip:
         return grip
     stiffness = np.repeat([coupling.stiffness, coupling.rotational_stiffness], 3)
@@ -347,22 +345,30 @@ def _stiffness_without_hand(
 
 
 def loaded_handle(
-    grip: tuple[float, ...], load: NDArray[np.float64], coupling: Coupling
+    grip: tuple[float, ...], load: NDArray[np.float64], parameters: RunParameters
 ) -> tuple[float, ...]:
     """Returns the handle pose (7,) at which the coupling carries a load on a tool at rest.
 
         h = x + f/K,    R_h = exp(τ/K_r) R_x
 
-    ``grip`` is the tool's pose (7,), ``load`` the wrench (6,) in N and N m.
+    K and K_r are those of the law at the load (``law.secant_stiffness``). ``grip`` is the tool's
+    pose (7,), ``load`` the wrench (6,) in N and N m, up to the levels.
     """
-    position = np.array(grip[:3]) + load[:3] / coupling.stiffness
+    coupling, (force, torque) = parameters.coupling, _sizes(load)
+    secant, (level, level_r) = source_of(secant_stiffness), parameters.levels_on_tool
+    position = np.array(grip[:3]) + load[:3] / secant(Spring(coupling.stiffness, level), force)
     orientation, turn = np.array(grip[3:]), np.zeros(4)
-    angle = float(np.linalg.norm(load[3:]))
-    if angle > 0.0 and coupling.rotational_stiffness > 0.0:
-        twist = min(angle / coupling.rotational_stiffness, MAX_START_TWIST)
-        mujoco.mju_axisAngle2Quat(turn, load[3:] / angle, twist)
+    if torque > 0.0 and coupling.rotational_stiffness > 0.0:
+        angular = Spring(coupling.rotational_stiffness, level_r)
+        twist = min(torque / secant(angular, torque), MAX_START_TWIST)
+        mujoco.mju_axisAngle2Quat(turn, load[3:] / torque, twist)
         mujoco.mju_mulQuat(orientation, turn, np.array(grip[3:]))
     return (*position.tolist(), *orientation.tolist())
+
+
+def _sizes(wrench: NDArray[np.float64]) -> tuple[float, float]:
+    """Returns the norms of a wrench's force and torque."""
+    return float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
 
 
 MAX_START_TWIST = 1.0

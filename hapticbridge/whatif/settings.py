@@ -211,7 +211,7 @@ def changes_from(words: Iterable[str]) -> list[dict[str, Value]]:
     """Parses changes such as ``stiffness=3000`` and ``method=explicit``.
 
     One setting may have several values, as ``stiffness=400,800`` or by its name again: each of them
-    gives a change of its own, beside the other settings.
+    gives a change of its own, beside the other settings. A name may have the dashes of its flag.
 
     Raises:
         RecordingError: A word is not a name and a value, or two settings have several values.
@@ -224,7 +224,7 @@ def changes_from(words: Iterable[str]) -> list[dict[str, Value]]:
                 f"cannot change '{word:.80}'; write a name and a value, such as stiffness=3000; "
                 f"names: {choices(CHANGEABLE)}, and the scene's parameters"
             )
-        values.setdefault(name, []).extend(part.strip() for part in text.split(","))
+        values.setdefault(_plain_name(name), []).extend(part.strip() for part in text.split(","))
     several = [name for name, each in values.items() if len(each) > 1]
     if len(several) > 1:
         raise RecordingError(
@@ -235,6 +235,13 @@ def changes_from(words: Iterable[str]) -> list[dict[str, Value]]:
         {name: each[index if len(each) > 1 else 0] for name, each in values.items()}
         for index in range(count)
     ]
+
+
+def _plain_name(name: str) -> str:
+    """Returns a name without the dashes of a flag; one of the scene's parameters stays."""
+    grip, colon, setting = name.rpartition(":")
+    plain = setting.replace("-", "_")
+    return f"{grip}{colon}{plain}" if plain in CHANGEABLE else name
 
 
 def _unit(name: str) -> str:

@@ -6,6 +6,8 @@ run that fails and its safe twin.
 
 To add a map, write such a file, with ``DEFAULT_POINTS`` and the functions that ``StabilityMap``
 names, and add it to ``_IN_ORDER`` below. Its docstring begins with "Map NAME: its subject."
+``tests/test_lab_maps_twins.py`` needs its port at fault in ``PORTS``, and in ``DIFFERENCES`` the
+value in which its twins differ.
 """
 
 from hapticbridge.lab.maps import (
