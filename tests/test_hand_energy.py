@@ -46,15 +46,15 @@ BESIDE = """<mujoco><option timestep="0.001"/><worldbody><geom type="plane" size
 </body></worldbody><actuator><motor name="puller" joint="x"/></actuator></mujoco>"""
 """A sledge on a motor, and a block that falls beside it: 2.45 J for 1 kg, burned by the floor."""
 
-HONEY = SLEDGE.replace("<worldbody>", """<worldbody><body pos="1 0 2">
-<joint name="z" type="slide" axis="0 0 1" damping="{{sinks}}"/>
-<geom type="box" size=".05 .05 .05" mass="1"/></body>""").format(
-    damping=0, motor='<actuator><motor name="puller" joint="x"/>{lift}</actuator>'
-)
+LOSING = """<mujoco><option timestep="0.001"/><worldbody><body name="sledge">
+<joint name="x" type="slide" axis="1 0 0"/><geom type="box" size=".02 .02 .02" mass="0.3"/>
+<site name="grip"/></body><body pos="1 0 2"><joint name="z" type="slide" axis="0 0 1"
+damping="{sinks}"/><geom type="box" size=".05 .05 .05" mass="1"/></body></worldbody>
+<actuator><motor name="puller" joint="x"/>{lift}</actuator></mujoco>"""
 """A sledge on a motor, and 1 kg that sinks beside it at 9.8 N / ``sinks``, or on a hoist."""
 
-SINKING = HONEY.format(sinks=20, lift="")
-HOISTED = HONEY.format(sinks=0, lift='<velocity name="hoist" joint="z" kv="50"/>')
+SINKING = LOSING.format(sinks=20, lift="")
+HOISTED = LOSING.format(sinks=0, lift='<velocity name="hoist" joint="z" kv="50"/>')
 
 CARRIAGE = """<mujoco><option timestep="0.001"/><worldbody>
 <body gravcomp="1"><joint name="z" type="slide" axis="0 0 1" actuatorgravcomp="{by_actuator}"/>

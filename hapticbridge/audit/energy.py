@@ -165,8 +165,8 @@ class EnergyBalance:
         net_energy: Energy given to the hand beyond what the device's damping burned, less what the
             scene's storage had given before the tick (``released``), (n,) in J; zero without a
             hand. It is what the guard's energy limit bounds, with the damping that the guard takes.
-        gross_energy: Energy given to the hand beyond what the device's damping burned and beyond the
-            unfelt work, (n,) in J; zero without a hand.
+        gross_energy: Energy given to the hand beyond what the device's damping burned and beyond
+            the unfelt work, (n,) in J; zero without a hand.
         unpaid_energy: Energy given to the hand beyond what may have paid for it before the tick,
             (n,) in J (``hand_energy.HandEnergy``); zero without a hand.
         springs: Energy at the hand that the coupling's springs held at the start and after each
@@ -306,7 +306,7 @@ def _hand_energies(
 def _released(
     totals: dict[str, Array], before: dict[str, float], stored: Array, is_reset: NDArray[np.bool_]
 ) -> dict[str, Array]:
-    """Returns R of ``passivity_controller.observe_release`` after each tick, and what it is made of.
+    """Returns R of ``passivity_controller.observe_release`` after each tick, and its parts.
 
     Args:
         totals: W_c ``coupling_work``, Σ E ``created`` and the works ``motors`` and ``external``

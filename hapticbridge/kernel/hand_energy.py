@@ -12,8 +12,8 @@ and a fortieth of the guard's usual energy limit. A smaller value fails runs for
 larger one can be felt."""
 
 _BOUND = (
-    "only --energy-limit bounds what they give the hand, and what bodies lose beside the tool comes "
-    "on top"
+    "only --energy-limit bounds what they give the hand, and what bodies lose beside the tool "
+    "comes on top"
 )
 
 

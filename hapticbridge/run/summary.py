@@ -79,7 +79,7 @@ class Ledger:
 
     Attributes:
         kinetic: Present kinetic energy.
-        potential: Present potential energy of gravity and springs.
+        potential: Present potential energy of gravity, its compensation, and springs.
         coupling_work: Work of the coupling on the tool, Σ f_k·δx_k + τ_k·δφ_k.
         actuator_work: Work of the scene's own actuators.
         external_work: Work of applied forces, moved mocap bodies and resets.
