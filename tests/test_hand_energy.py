@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -132,7 +132,6 @@ FLOATING = SPHERE.format(gravity=0, mass=0.3)
         (DRIVEN, {"on_tick": drive}),
         (BESIDE.format(mass=1.0), {"on_tick": drive}),
         (PUMP, {"duration": 2.0, "controller": "off"}),
-        (DROPPED, {"on_tick": pull_through_a_start, "limits": replace(DEVICE_LIMITS, energy=1.0)}),
     ],
 )
 def test_run_and_audit_meter_one_energy_and_print_one_line(
@@ -148,6 +147,20 @@ def test_run_and_audit_meter_one_energy_and_print_one_line(
     assert f"; net to the hand {ours.sentence}" in report.reason
     assert f'"net": {theirs.net!r}' in report.to_json()
     assert summary.is_certified is report.certified
+
+
+@pytest.mark.parametrize("options", [{}, {"substeps": 2}, {"scene_rate": 250.0}])
+def test_run_and_audit_agree_after_a_reset_which_is_no_push(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
+    limits = replace(DEVICE_LIMITS, energy=1.0)
+    options = options | {"on_tick": pull_through_a_start, "limits": limits}
+    summary, report = ran(tmp_path, DROPPED, **options)
+    ours, theirs = summary.hand_energy, report.hand_energy
+    assert asdict(ours) == pytest.approx(asdict(theirs), rel=1e-9, abs=1e-10)
+    assert summary.energies["external_work"] > 0.05
+    assert ours.inputs == pytest.approx(0.0, abs=1e-12)
+    assert ours.limit.startswith("motors of the scene pushed")
 
 
 def test_a_hand_that_got_what_nothing_released_holds_no_certified_device(tmp_path: Path) -> None:

@@ -563,6 +563,12 @@ def add_reset_work(energy: Part, work: float) -> None:
     energy["external_work"] += work
 
 
+def take_scene_works(energy: Part, scene: Part) -> None:
+    """Takes the works of a slower scene's ports, of a step that a reset ended."""
+    for name in ("actuator_work", "external_work"):
+        energy[name] = scene[name]
+
+
 @compiled
 def meter_device(s: State, moved: Vector, turned: Vector, interval: float) -> None:
     """Adds the work on the device, and the least dissipation of its damper, b ‖δp‖²/t.
