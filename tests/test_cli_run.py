@@ -219,7 +219,7 @@ def test_a_motor_that_pulls_the_tool_is_told_as_the_load_and_as_the_reason_of_th
 @pytest.mark.usefixtures("undrawn")
 def test_a_certificate_names_its_limit_where_motors_pushed(call: Called, tmp_path: Path) -> None:
     scene, record, page = (tmp_path / name for name in ("weak.xml", "weak.mcap", "weak.html"))
-    pushed = "but motors of the scene pushed: what they give the hand, only --energy-limit bounds"
+    pushed = "but motors of the scene pushed: only --energy-limit bounds what they give the hand"
     for control, told in (("0.002", True), ("0", False)):
         scene.write_text(DRIVEN.replace('ctrl="0.1"', f'ctrl="{control}"'))
         limit = ("--energy-limit", 1, "--record", record, "--overwrite")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, SlowClock, recorded
 from bridge_runs import fast, sway
@@ -17,9 +18,11 @@ from two_hands import BAR
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.demand.certification import Standing, worst_certification
 from hapticbridge.demand.guard import DEVICE_LIMITS
-from hapticbridge.device import SimulatedDevice
+from hapticbridge.demand.trip import Trip, TripCode
+from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
+from hapticbridge.recording import read_recording
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.hands import Grasp
 from hapticbridge.run.options import Workspace
@@ -42,6 +45,26 @@ BESIDE = """<mujoco><option timestep="0.001"/><worldbody><geom type="plane" size
 <body name="beside" pos="1 0 .3"><freejoint/><geom type="box" size=".05 .05 .05" mass="{mass}"/>
 </body></worldbody><actuator><motor name="puller" joint="x"/></actuator></mujoco>"""
 """A sledge on a motor, and a block that falls beside it: 2.45 J for 1 kg, burned by the floor."""
+
+LOSING = """<mujoco><option timestep="0.001"/><worldbody><body name="sledge">
+<joint name="x" type="slide" axis="1 0 0"/><geom type="box" size=".02 .02 .02" mass="0.3"/>
+<site name="grip"/></body><body pos="1 0 2"><joint name="z" type="slide" axis="0 0 1"
+damping="{sinks}"/><geom type="box" size=".05 .05 .05" mass="1"/></body></worldbody>
+<actuator><motor name="puller" joint="x"/>{lift}</actuator></mujoco>"""
+"""A sledge on a motor, and 1 kg that sinks beside it at 9.8 N / ``sinks``, or on a hoist."""
+
+SINKING = LOSING.format(sinks=20, lift="")
+HOISTED = LOSING.format(sinks=0, lift='<velocity name="hoist" joint="z" kv="50"/>')
+
+CARRIAGE = """<mujoco><option timestep="0.001"/><worldbody>
+<body gravcomp="1"><joint name="z" type="slide" axis="0 0 1" actuatorgravcomp="{by_actuator}"/>
+<geom size=".03" mass="1"/><body name="tool" pos="0.05 0 0"><geom size=".02" mass="0.3"/>
+<site name="grip"/></body></body></worldbody>{motor}</mujoco>"""
+"""A carriage of 1 kg that carries itself, and 0.3 kg on it that the hand holds."""
+
+DROPPED = """<mujoco><option timestep="0.001"/><worldbody><body name="tool">
+<joint name="z" type="slide" axis="0 0 1"/><geom size=".02" mass="0.5"/><site name="grip"/></body>
+</worldbody><actuator><motor name="puller" joint="z"/></actuator></mujoco>"""
 
 PUMP, BRAKE = (SLEDGE.format(damping=damping, motor="") for damping in (-10, 10))
 """A sledge with negative damping, which creates energy, and one that takes it."""
@@ -76,6 +99,22 @@ def start_twice_more(bridge: Bridge, tick: int) -> None:
         bridge.repeat_commands([{"event": "reset", "tick": tick}])
 
 
+def pull_through_a_start(bridge: Bridge, tick: int) -> None:
+    """A motor that pulls down at 2 N, and a reset while it does."""
+    if tick == 200:
+        bridge.repeat_commands([{"event": "reset", "tick": tick}])
+    if tick in (50, 201):
+        bridge.set_input(ctrl={"puller": -2.0})
+
+
+def rock(bridge: Bridge, tick: int) -> None:
+    """A motor that pushes to and fro with 4 N, and a hoist, if there is one, that lets down."""
+    if tick >= 500 and tick % 10 == 0:
+        bridge.set_input(ctrl={"puller": 4.0 * math.sin(0.0094 * tick)})
+    if tick == 10 and bridge.scene.model.nactuator > 7:
+        bridge.set_input(ctrl={"hoist": -0.3})
+
+
 WEIGHT = SPHERE.format(gravity=-9.81, mass=0.9)
 FLOATING = SPHERE.format(gravity=0, mass=0.3)
 
@@ -108,6 +147,20 @@ def test_run_and_audit_meter_one_energy_and_print_one_line(
     assert f"; net to the hand {ours.sentence}" in report.reason
     assert f'"net": {theirs.net!r}' in report.to_json()
     assert summary.is_certified is report.certified
+
+
+@pytest.mark.parametrize("options", [{}, {"substeps": 2}, {"scene_rate": 250.0}])
+def test_run_and_audit_agree_after_a_reset_which_is_no_push(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
+    limits = replace(DEVICE_LIMITS, energy=1.0)
+    options = options | {"on_tick": pull_through_a_start, "limits": limits}
+    summary, report = ran(tmp_path, DROPPED, **options)
+    ours, theirs = summary.hand_energy, report.hand_energy
+    assert asdict(ours) == pytest.approx(asdict(theirs), rel=1e-9, abs=1e-10)
+    assert summary.energies["external_work"] > 0.05
+    assert ours.inputs == pytest.approx(0.0, abs=1e-12)
+    assert ours.limit.startswith("motors of the scene pushed")
 
 
 def test_a_hand_that_got_what_nothing_released_holds_no_certified_device(tmp_path: Path) -> None:
@@ -167,7 +220,10 @@ def test_what_pushed_limits_the_certificate(
     text: str, on_tick: Callable[[Bridge, int], None], name: str, tmp_path: Path
 ) -> None:
     summary, report = ran(tmp_path, text, on_tick=on_tick)
-    limit = f"{name} of the scene pushed: what they give the hand, only --energy-limit bounds"
+    limit = (
+        f"{name} of the scene pushed: only --energy-limit bounds what they give the hand, and what "
+        "bodies lose beside the tool comes on top"
+    )
     assert f"device certified: b >= KT/2 + B_law, but {limit}" in str(summary)
     assert report.hand_energy.limit == limit
     assert f"the scene's {name} did " in report.reason
@@ -189,6 +245,59 @@ def test_what_a_body_beside_the_tool_loses_hides_no_motor(mass: float, tmp_path:
     report = audit(tmp_path / "run.mcap")
     assert 0.03 < report.hand_energy.net < 0.06
     assert report.hand_energy.scene < 1e-3
+
+
+@pytest.mark.parametrize("text", [SINKING, HOISTED])
+def test_a_motor_that_a_lost_weight_hides_limits_the_certificate(text: str, tmp_path: Path) -> None:
+    """The scene loses more than the motor gives: no net energy shows it, its own work does."""
+    summary, report = ran(tmp_path, text, on_tick=rock, duration=2.0)
+    assert summary.energies["device_energy"] > 0.1
+    assert summary.hand_energy.net <= INSTANT
+    assert "b >= KT/2 + B_law, but motors of the scene pushed: only --energy-limit" in str(summary)
+    assert summary.hand_energy.limit == report.hand_energy.limit
+    assert (summary.is_certified, report.certified) == (True, True)
+
+
+def test_work_that_cannot_have_reached_the_hand_is_no_limit() -> None:
+    falling = HandEnergy(gross=0.2, scene=0.2)
+    assert not falling.limit
+    assert not replace(falling, motors=0.5 * INSTANT, inputs=-0.5 * INSTANT).limit
+    assert not replace(falling, springs=0.2, motors=0.1).limit
+    assert not HandEnergy(gross=0.5 * INSTANT, motors=0.1).limit
+    assert replace(falling, motors=-0.1).limit.startswith("motors of the scene pushed")
+    assert "the scene's motors took 100 mJ, and" in replace(falling, motors=-0.1).sentence
+
+
+@pytest.mark.parametrize("by_actuator", ["false", "true"])
+def test_what_a_carried_weight_took_on_the_way_down_pays_for_its_way_up(
+    by_actuator: str, tmp_path: Path
+) -> None:
+    """It counted as a push of 0.2 J, and a tool that nothing drove tripped the run."""
+    times = np.array([0.0, 0.5, 1.5, 2.0, 2.6, 3.0])
+    position, at_rest = np.zeros((6, 3)), np.tile([1.0, 0, 0, 0], (6, 1))
+    position[:, 2] = [0.0, 0.0, -0.06, -0.06, -0.04, -0.04]
+    device = SimulatedDevice(path=Motion(times, position, at_rest))
+    text = CARRIAGE.format(by_actuator=by_actuator, motor="")
+    summary, report = ran(tmp_path, text, device, duration=3.0)
+    height = read_recording(tmp_path / "run.mcap").ticks["tool_position"][:, 2]
+    assert height[-1] - height.min() > 0.015
+    assert report.hand_energy.scene == pytest.approx(-0.3 * 9.81 * height[-1], rel=0.02)
+    assert report.hand_energy.motors == pytest.approx(0.0, abs=1e-12)
+    assert report.hand_energy.inputs == 0.0
+    assert (summary.is_certified, report.certified) == (True, True)
+    assert not report.hand_energy.limit
+
+
+def test_a_motor_beside_gravity_compensation_is_bounded(tmp_path: Path) -> None:
+    def lift(bridge: Bridge, tick: int) -> None:
+        if tick == 700:
+            bridge.set_input(ctrl={"puller": 8.0})
+
+    motor = '<actuator><motor name="puller" joint="z"/></actuator>'
+    text = CARRIAGE.format(by_actuator="false", motor=motor)
+    with pytest.raises(SafetyTrip, match="energy limit"):
+        ran(tmp_path, text, on_tick=lift)
+    assert audit(tmp_path / "run.mcap").hand_energy.net < 0.05
 
 
 def test_motors_that_took_their_work_back_still_pushed() -> None:
@@ -253,3 +362,35 @@ def test_a_trip_by_inputs_names_them_and_not_the_stiffness(tmp_path: Path) -> No
     (note,) = trip.value.__notes__
     assert note.startswith("the scene's inputs (applied forces, moved mocap bodies")
     assert "--stiffness" not in note
+
+
+def test_a_trip_by_motors_that_took_more_than_they_gave_names_them(tmp_path: Path) -> None:
+    """The hoist took more than the other motor gave, so the work of all motors was negative."""
+
+    def push_beside_a_hoist(bridge: Bridge, tick: int) -> None:
+        if tick % 10 == 0:
+            force = 9.0 * math.sin(0.0126 * tick) if tick >= 500 else 0.0
+            bridge.set_input(ctrl={"hoist": -0.1, "puller": force})
+
+    with pytest.raises(SafetyTrip) as trip:
+        ran(tmp_path, HOISTED, on_tick=push_beside_a_hoist, duration=2.0)
+    (note,) = trip.value.__notes__
+    assert note.startswith("the scene's motors took ")
+    report = audit(tmp_path / "run.mcap")
+    assert report.trip is not None
+    assert report.trip.remedy(report.hand_energy).startswith("the scene's motors took ")
+
+
+@pytest.mark.parametrize(
+    ("energy", "words"),
+    [
+        (HandEnergy(net=4e-3, motors=3e-3), "the scene's motors did 3 mJ of work"),
+        (HandEnergy(net=4e-3, inputs=-3e-3), "moved mocap bodies) took 3 mJ until then"),
+        (HandEnergy(net=0.04, motors=0.01, inputs=0.01), "lower --stiffness"),
+        (HandEnergy(net=0.0, motors=0.5 * INSTANT), "lower --stiffness"),
+    ],
+)
+def test_a_trip_names_the_port_that_did_at_least_half_of_the_net(
+    energy: HandEnergy, words: str
+) -> None:
+    assert words in Trip(TripCode.GAVE_ENERGY, 5).remedy(energy)

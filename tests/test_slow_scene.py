@@ -133,6 +133,18 @@ def test_late_results_are_recorded_and_repeated(tmp_path: Path) -> None:
     assert gaps.max() > 2
 
 
+def test_a_program_that_changes_an_input_in_every_tick_is_audited(tmp_path: Path) -> None:
+    """The audit then simulates tick by tick, in a child that may not compile."""
+    body = load_scene("virtual_wall").model.body(1).name
+
+    def push(bridge: Bridge, tick: int) -> None:
+        bridge.set_input(body_wrench={body: (1e-3 * tick, 0, 0, 0, 0, 0)})
+
+    path, device = tmp_path / "run.mcap", ScriptedDevice(stroke)
+    recorded(path, "virtual_wall", device, scene_rate=200.0, duration=0.05, on_tick=push)
+    assert audit(path).resimulation == "bit for bit"
+
+
 def test_a_run_against_the_wall_clock_ends_with_its_thread(tmp_path: Path) -> None:
     path = tmp_path / "real.mcap"
     before = threading.active_count()

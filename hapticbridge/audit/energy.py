@@ -165,11 +165,14 @@ class EnergyBalance:
         net_energy: Energy given to the hand beyond what the device's damping burned, less what the
             scene's storage had given before the tick (``released``), (n,) in J; zero without a
             hand. It is what the guard's energy limit bounds, with the damping that the guard takes.
+        gross_energy: Energy given to the hand beyond what the device's damping burned and beyond
+            the unfelt work, (n,) in J; zero without a hand.
         unpaid_energy: Energy given to the hand beyond what may have paid for it before the tick,
             (n,) in J (``hand_energy.HandEnergy``); zero without a hand.
         stored: q (W_c + V − V_0) of ``kernel.timing`` after each tick, (n,) in J.
         springs: Energy at the hand that the coupling's springs held at the start and after each
             reset, in J.
+        input_work: Cumulative work of the scene's inputs without that of resets, (n,) in J.
         released: Energy in J that the scene's storage has given to the hand after the last tick.
         contact_tank: Energy that may pay for the depenetration of rigid contacts, (n,) in J; zero
             with the contacts of the scene.
@@ -184,9 +187,11 @@ class EnergyBalance:
     slack: Array
     excess_device_energy: Array
     net_energy: Array
+    gross_energy: Array
     unpaid_energy: Array
     stored: Array
     springs: float
+    input_work: Array
     released: float
     contact_tank: Array
     sums: dict[str, float]
@@ -237,7 +242,7 @@ class EnergyBalance:
             in_springs = in_springs - totals["start_springs"]
         excess = _device_excess(parameters, totals, created, in_springs)
         totals |= {"created": created, "taken": np.maximum(created, 0.0) + coupling_work}
-        totals["pushes"] = ticks["actuator_work"] + ticks["external_work"]
+        totals |= {"motors": ticks["actuator_work"], "external": ticks["external_work"]}
         totals |= _released(totals, before, stored - others_work, is_reset)
         ratio = parameters.force_scale / parameters.scale
         net, unpaid = _hand_energies(ratio, totals, before, is_reset)
@@ -257,9 +262,12 @@ class EnergyBalance:
             slack=totals["slack"],
             excess_device_energy=excess,
             net_energy=net * parameters.guarding.has_hand,
+            gross_energy=(totals["hand_energy"] - totals["unfelt_work"])
+            * parameters.guarding.has_hand,
             unpaid_energy=unpaid * parameters.guarding.has_hand,
             stored=ratio * (coupling_work + held),
             springs=float(ratio * totals["start_springs"][-1]),
+            input_work=totals["inputs"],
             released=float(totals["released"][-1]),
             contact_tank=(ceiling - created) * (parameters.is_rigid and not parameters.scene_ticks),
             sums={name: float(total[-1]) for name, total in totals.items()},
@@ -303,17 +311,20 @@ def _hand_energies(
 def _released(
     totals: dict[str, Array], before: dict[str, float], stored: Array, is_reset: NDArray[np.bool_]
 ) -> dict[str, Array]:
-    """Returns R of ``passivity_controller.released_energy`` after each tick, m and W_c at a reset.
+    """Returns R of ``passivity_controller.observe_release`` after each tick, and its parts.
 
     Args:
-        totals: W_c ``coupling_work``, Σ E ``created`` and W_p ``pushes`` after each tick, in J.
-        before: The same before the first of these ticks, with m and W_c at the last reset.
+        totals: W_c ``coupling_work``, Σ E ``created`` and the works ``motors`` and ``external``
+            after each tick, in J.
+        before: Their values before the first of these ticks, with m, W_c at the last reset, and the
+            inputs' work.
         stored: S − S_0 without the work of other hands, (n,) in J.
-        is_reset: True for a tick that begins with a reset, whose own work m leaves out.
+        is_reset: True for a tick that begins with a reset, whose works m leaves out.
     """
-    names = "coupling_work", "created", "pushes"
-    work, created, pushes = (np.concatenate([[before[name]], totals[name]]) for name in names)
-    steps = np.where(is_reset, 0.0, np.diff(pushes) + np.minimum(np.diff(created), 0.0))
+    names = "coupling_work", "created", "motors", "external"
+    work, *others = (np.concatenate([[before[name]], totals[name]]) for name in names)
+    created, motors, external = (np.where(is_reset, 0.0, np.diff(each)) for each in others)
+    steps = motors + external + np.minimum(created, 0.0)
     pushed, at_reset = np.empty(len(steps)), np.empty(len(steps))
     last, base = before["pushed"], before["work_at_reset"]
     edges = np.unique([0, *np.flatnonzero(is_reset), len(steps)])
@@ -326,7 +337,8 @@ def _released(
         last, at_reset[first:end] = pushed[end - 1], base
     given = at_reset - work[1:] - pushed
     released = np.maximum(np.minimum(given, -stored), 0.0)
-    return {"released": released, "pushed": pushed, "work_at_reset": at_reset}
+    inputs = _summed(external, before["inputs"])
+    return {"released": released, "pushed": pushed, "work_at_reset": at_reset, "inputs": inputs}
 
 
 def _summed(values: Array, before: float) -> Array:

@@ -201,6 +201,8 @@ class Resimulator:
         )
         samples["buttons"] = ticks["buttons"]
         outside = ticks["flags"] & int(TickFlag.STALE_SAMPLE)
+        # a view of a record is read-only, for which no machine code is on disk
+        scene_steps = ticks["scene_step"].copy()
         elapsed = self._elapsed(ticks if self.hands is None else ticks[:, 0])
         rows = np.zeros(ticks.shape, TICK_DTYPE)
         own, done = self.hands or self.binding, 0
@@ -214,8 +216,7 @@ class Resimulator:
             part = slice(done, end)
             if self._slow is not None:
                 inputs = samples[part], outside[part], elapsed[part]
-                steps = np.ascontiguousarray(ticks["scene_step"][part])
-                count = self._slow.simulate(*inputs, steps, rows[part])
+                count = self._slow.simulate(*inputs, scene_steps[part], rows[part])
             else:
                 count = simulate_recorded(
                     own.state, each[part], flags[part], elapsed[part], own.row, found[part]

@@ -297,8 +297,9 @@ class PassivityTally:
             unpaid=max(self.hand_energy.unpaid, float(np.max(balance.unpaid_energy))),
             springs=balance.springs,
             scene=balance.released,
-            motors=float(last["actuator_work"]),
-            inputs=float(last["external_work"]),
+            motors=_peak(self.hand_energy.motors, ticks["actuator_work"]),
+            inputs=_peak(self.hand_energy.inputs, balance.input_work),
+            gross=max(self.hand_energy.gross, float(np.max(balance.gross_energy))),
         )
         self.energies = {name: float(last[name]) for name in _RECORDED} | {
             "coupling_work": float(balance.coupling_work[-1]),
@@ -306,6 +307,12 @@ class PassivityTally:
             "device_energy": float(balance.device_energy[-1]),
             "slack": float(balance.slack[-1]),
         }
+
+
+def _peak(before: float, works: NDArray[np.float64]) -> float:
+    """Returns the work of largest size, the earlier one among equals."""
+    found = np.append(before, works)
+    return float(found[np.argmax(np.abs(found))])
 
 
 def _first(

@@ -234,14 +234,12 @@ class Audit:
         """Prints what to change after a trip of a run that was passive until then."""
         recording = read_recording(report.path, 0)
         cause = pump_behind_trip(recording, report, in_process=self.in_process)
-        work = report.energies.get("actuator_work", 0.0)
         if cause is not None:
             out.print(f"likely cause: {plain(f'{cause.kind}. {cause.evidence}')}")
             remedy = cause.remedy
         else:
             created = report.energies.get("environment_energy", 0.0)
-            inputs = report.energies.get("external_work", 0.0)
-            remedy = trip.remedy(work, created, input_work=inputs)
+            remedy = trip.remedy(report.hand_energy, created)
         if remedy:
             out.print(f"what to change: {plain(remedy)}")
         page = "active-verdict" if cause is not None or report.hand_energy.limit else "faults"

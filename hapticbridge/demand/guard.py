@@ -73,9 +73,10 @@ class Limits:
         stretch: Largest distance between handle and tool divided by the scale, in m; beyond it the
             run is stopped.
         angle: Largest angle between handle and tool in rad, below pi; beyond it the run is stopped.
-        energy: Largest energy in J that the hand may get beyond what it put in. A wrench that would
-            pass it is not sent and the run is stopped. inf for scenes whose motors are meant to
-            push the hand.
+        energy: Largest energy in J that the hand may get beyond what it put in and what the scene's
+            storage gave. The storage is that of all bodies together: what bodies lose beside the
+            tool may pass from motors to the hand on top. A wrench that would pass the limit is not
+            sent and the run is stopped. inf for scenes whose motors are meant to push the hand.
         reach: Largest distance in m of the device from the middle of its workspace; beyond it the
             device moves without handle and force, and the run goes on. By default the reach of its
             data sheet, else inf. A smaller limit keeps force away from its mechanical stops.

@@ -10,6 +10,7 @@ from typing import Any
 from hapticbridge.demand.guard import USUAL_ENERGY
 from hapticbridge.errors import RecordingError
 from hapticbridge.kernel import codes
+from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy, work_words
 from hapticbridge.units import format_energy
 
 BY_TRIP = "trip"
@@ -78,15 +79,14 @@ _REMEDIES = {
 }
 
 _LIMIT_MOTORS = (
-    "the scene's motors did {} of work until then{}: limit their force (forcerange), or start a "
+    "the scene's motors {} until then{}: limit their force (forcerange), or start a "
     "motor at ctrl 0 and a servo at its target (keyframe 'home'); 'hapticbridge check SCENE' names "
     "those that push at the start; if they are meant to push the hand, --energy-limit is what it "
     "may get"
 )
 _LIMIT_INPUTS = (
-    "the scene's inputs (applied forces, moved mocap bodies, gravity compensation) did {} of work "
-    "until then: make them smaller or slower; if they are meant to push the hand, --energy-limit "
-    "is what it may get"
+    "the scene's inputs (applied forces, moved mocap bodies) {} until then: make them smaller or "
+    "slower; if they are meant to push the hand, --energy-limit is what it may get"
 )
 _FIND_PUMP = (
     "the scene itself created {} until then: 'hapticbridge check SCENE' looks for what pumps, and "
@@ -173,27 +173,21 @@ class Trip:
             *(TripCode.DIVERGED, TripCode.STRETCHED, TripCode.TWISTED, TripCode.GAVE_ENERGY),
         )
 
-    def remedy(
-        self,
-        motor_work: float,
-        created: float = 0.0,
-        strongest: str = "",
-        input_work: float = 0.0,
-    ) -> str:
+    def remedy(self, energy: HandEnergy, created: float = 0.0, strongest: str = "") -> str:
         """Returns the remedy for the message to the user; empty if none is known.
 
         Args:
-            motor_work: Work of the scene's own motors until then in J, which may be the cause.
+            energy: Energy of the hand until then, with the works of the scene's motors and inputs.
             created: Energy in J that the scene had created until then, which may be the cause.
             strongest: Name of the actuator that pushes most, or empty.
-            input_work: Work of the scene's inputs until then in J, which may be the cause.
         """
         if self.code == TripCode.GAVE_ENERGY:
+            least = max(0.5 * energy.net, INSTANT)
             if created > USUAL_ENERGY:
                 return _FIND_PUMP.format(format_energy(created))
-            if motor_work > 0.5 * USUAL_ENERGY:
+            if abs(energy.motors) > least:
                 most = f" ('{strongest}' pushes most)" if strongest else ""
-                return _LIMIT_MOTORS.format(format_energy(motor_work), most)
-            if input_work > 0.5 * USUAL_ENERGY:
-                return _LIMIT_INPUTS.format(format_energy(input_work))
+                return _LIMIT_MOTORS.format(work_words(energy.motors), most)
+            if abs(energy.inputs) > least:
+                return _LIMIT_INPUTS.format(work_words(energy.inputs))
         return _REMEDIES.get(self.code, "")

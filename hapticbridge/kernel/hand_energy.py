@@ -11,6 +11,16 @@ INSTANT = 1e-3
 and a fortieth of the guard's usual energy limit. A smaller value fails runs for one late force; a
 larger one can be felt."""
 
+_BOUND = (
+    "only --energy-limit bounds what they give the hand, and what bodies lose beside the tool "
+    "comes on top"
+)
+
+
+def work_words(work: float) -> str:
+    """Returns a work in J of a scene's port as a verb with its object."""
+    return f"took {format_energy(-work)}" if work < 0 else f"did {format_energy(work)} of work"
+
 
 @dataclass(frozen=True, slots=True)
 class HandEnergy:
@@ -31,14 +41,21 @@ class HandEnergy:
     Nothing else needs an allowance. The inequality holds for the positions that were read, of which
     the law made the forces: encoder steps and delays within the device cannot exceed it.
 
+    The storage in R is that of all bodies together. What bodies lose beside the tool, as a load
+    that is let down, may therefore pass from motors to the hand on top of the energy limit. So a
+    port counts as pushing by its own work and by ``gross``, which does not depend on R.
+
     Attributes:
-        net: Largest E − q R in J with R of ``passivity_controller.released_energy``; the guard's
+        net: Largest E − q R in J with R of ``passivity_controller.observe_release``; the guard's
             energy limit bounds it.
         unpaid: Largest unpaid energy in J.
         springs: q V_0 in J.
         scene: R, energy in J that the scene's storage has given to the hand.
-        motors: W_m in J of the scene; negative if motors took back more than they gave.
-        inputs: W_i in J of the scene: applied forces, moved mocap bodies, gravity compensation.
+        motors: Work in J that the scene's motors had done when it was largest in size; negative if
+            they had taken energy then.
+        inputs: Work in J of the scene's inputs, taken in the same way: applied forces and moved
+            mocap bodies. Gravity compensation and resets are not counted.
+        gross: Largest E − W_u in J.
 
     References:
         Brown & Colgate 1997, eq. (6), as an identity over time.
@@ -50,14 +67,18 @@ class HandEnergy:
     scene: float = 0.0
     motors: float = 0.0
     inputs: float = 0.0
+    gross: float = 0.0
 
     @property
     def _pushing(self) -> tuple[str, ...]:
-        """Names of the scene's ports that did work, if they paid for more than ``INSTANT``."""
+        """Names of the scene's ports that did work, if they may have paid for over ``INSTANT``."""
         ports = {"motors": abs(self.motors), "inputs": abs(self.inputs)}
-        if self.net - self.springs - max(self.unpaid, 0.0) <= INSTANT:
+        paid = self.springs + max(self.unpaid, 0.0)
+        if max(self.gross, self.net) - paid <= INSTANT:
             return ()
-        least = min(INSTANT, 0.5 * max(ports.values()))
+        least = INSTANT
+        if self.net - paid > INSTANT:  # no storage explains it
+            least = min(INSTANT, 0.5 * max(ports.values()))
         return tuple(name for name, work in ports.items() if work > least)
 
     @property
@@ -65,10 +86,7 @@ class HandEnergy:
         """Limit of a certificate, which covers no energy from motors and inputs; or empty."""
         if not self._pushing:
             return ""
-        return (
-            f"{' and '.join(self._pushing)} of the scene pushed: what they give the hand, only "
-            "--energy-limit bounds"
-        )
+        return f"{' and '.join(self._pushing)} of the scene pushed: {_BOUND}"
 
     @property
     def fault(self) -> str:
@@ -89,11 +107,9 @@ class HandEnergy:
         if self.scene > INSTANT:
             beyond.append(f"the {format_energy(self.scene)} that the scene released")
         works = {"motors": self.motors, "inputs": self.inputs}
-        origins = [
-            f"the scene's {name} did {format_energy(works[name])} of work" for name in self._pushing
-        ]
+        origins = [f"the scene's {name} {work_words(works[name])}" for name in self._pushing]
         if origins:
-            origins[-1] += ", and only --energy-limit bounds what they give the hand"
+            origins[-1] += f", and {_BOUND}"
         if self.springs > INSTANT:
             springs = format_energy(self.springs)
             origins.append(f"the coupling's springs held {springs} at the start or after resets")

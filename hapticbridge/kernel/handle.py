@@ -196,7 +196,8 @@ def anchor_handle(pose: Part) -> None:
 
 
 def move_handle_home(pose: Part) -> None:
-    """Puts the handle to its pose before the first tick, where it carries the tool at its start."""
+    """Puts the handle at rest to its pose before the first tick, where it carries the tool."""
+    pose["handle_step"] = pose["handle_turn"] = 0.0
     pose["handle_position"] = pose["handle_home"][:3]
     pose["handle_quaternion"] = pose["handle_home"][3:]
 

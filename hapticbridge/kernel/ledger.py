@@ -23,7 +23,7 @@ The accounts of energy, all in J; q = force_scale / scale:
 
 ``damper`` and ``environment`` are the passivity controllers. w is the wrench on the device, δp
 its motion, b its damping, t the time between two new samples, W the work of the scene's actuators
-and of external forces. W_u is ``passivity_controller.unfelt_work``, R its ``released_energy``.
+and of external forces. W_u is ``passivity_controller.unfelt_work``, R that of ``observe_release``.
 """
 
 from __future__ import annotations
@@ -153,8 +153,7 @@ def note_moved_mocap_bodies(s: State) -> None:
         _keep_residuals(s)
         mj_fwd_kinematics(mj.model, mj.data)
         mj_com_pos(mj.model, mj.data)
-        mj_energy_pos(mj.model, mj.data)
-        s.energy.external_work += floats(mj.energy, 2)[0] - s.energy.potential
+        s.energy.external_work += potential_energy(s) - s.energy.potential
 
 
 @compiled
@@ -306,14 +305,19 @@ def _actuator_work(s: State) -> float:
     F is the force at the step's start, m the moment, a = (v⁺ − v)/h, h the time step, k_p and k_v
     the gains of a servo. The two corrections take F to the end of the step. MuJoCo keeps them for
     the actuators in its effective metric: ``efm_ak`` = h k_p, ``efm_as`` = h² k_p + h k_v. The sum
-    uses ``qfrc_actuator``, which respects the joints' force limits, and subtracts the coupling.
+    uses ``qfrc_actuator``, which respects the joints' force limits, and subtracts the coupling. It
+    also subtracts gravity compensation (``actuatorgravcomp``), which ``potential_energy`` counts.
     """
     mj = s.mj
     h = s.run.timestep
     qvel, force = floats(mj.qvel, mj.nv), floats(mj.qfrc_actuator, mj.nv)
+    compensation, is_by_actuator = (
+        floats(mj.qfrc_gravcomp, mj.nv),
+        floats(mj.actuator_gravcomp_dofs, mj.nv),
+    )
     power = 0.0
     for i in range(mj.nv):
-        power += force[i] * qvel[i]
+        power += (force[i] - compensation[i] * is_by_actuator[i]) * qvel[i]
     first, own = mj.coupling_output_adr, mj.coupling_outputs
     forces = floats(mj.actuator_force, first + own)
     for output in range(first, first + own):
@@ -379,20 +383,13 @@ def add_body_wrenches(s: State, result: int, clears: bool = False) -> bool:
 
 @compiled
 def _applied_work(s: State) -> float:
-    """Returns the work of applied forces, body wrenches and passive gravity compensation in J."""
+    """Returns the work of applied forces and body wrenches in J."""
     mj = s.mj
     nv = mj.nv
     qvel, applied = floats(mj.qvel, nv), floats(mj.qfrc_applied, nv)
     power = 0.0
     for i in range(nv):
         power += applied[i] * qvel[i]
-    if mj.has_gravity_compensation:
-        compensation, is_passive = (
-            floats(mj.qfrc_gravcomp, nv),
-            floats(mj.passive_gravcomp_dofs, nv),
-        )
-        for i in range(nv):
-            power += compensation[i] * is_passive[i] * qvel[i]
     # positions are still those of the step's start, where MuJoCo applied the wrenches
     if add_body_wrenches(s, mj.scratch, clears=True):
         generalised = floats(mj.scratch, nv)
@@ -471,6 +468,27 @@ def refresh_inertia(s: State) -> None:
 
 
 @compiled
+def potential_energy(s: State) -> float:
+    """Returns the energy in J that the scene stores at the present positions.
+
+        V = V_0 + Σ c_i m_i g·x_i
+
+    V_0 is MuJoCo's energy of gravity and springs. Gravity compensation depends on positions alone,
+    so it stores energy, and a weight that it carries stores none. c_i is the ``gravcomp`` of body
+    i, m_i its mass in kg, x_i its centre of mass in m, g gravity in m/s².
+    """
+    mj = s.mj
+    mj_energy_pos(mj.model, mj.data)
+    potential = floats(mj.energy, 2)[0]
+    if mj.has_gravity_compensation:
+        masses, centres = floats(mj.compensated_mass, mj.nbody), floats(mj.xipos, 3 * mj.nbody)
+        gravity = vector_of(floats(mj.gravity, 3))
+        for body in range(mj.nbody):
+            potential += masses[body] * dot(gravity, vector_of(centres[3 * body :]))
+    return float(potential)
+
+
+@compiled
 def refresh_energies(s: State) -> None:
     """Computes kinetic and potential energy for the state after the step.
 
@@ -480,10 +498,9 @@ def refresh_energies(s: State) -> None:
     mj = s.mj
     if not s.loop.has_positions:
         refresh_inertia(s)
-    mj_energy_pos(mj.model, mj.data)
+    s.energy.potential = potential_energy(s)
     mj_energy_vel(mj.model, mj.data)
-    energy = floats(mj.energy, 2)
-    s.energy.potential, s.energy.kinetic = energy[0], energy[1]
+    s.energy.kinetic = floats(mj.energy, 2)[1]
 
 
 @compiled
@@ -544,6 +561,12 @@ def add_coupling_work(energy: Part, work: float) -> None:
 def add_reset_work(energy: Part, work: float) -> None:
     """Adds the storage that a reset of the scene put in, in J, to the external port."""
     energy["external_work"] += work
+
+
+def take_scene_works(energy: Part, scene: Part) -> None:
+    """Takes the works of a slower scene's ports, of a step that a reset ended."""
+    for name in ("actuator_work", "external_work"):
+        energy[name] = scene[name]
 
 
 @compiled

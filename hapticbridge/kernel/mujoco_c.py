@@ -389,7 +389,8 @@ _DATA_FIELDS = (
     "contact",
 )
 _OWNED = (
-    "passive_gravcomp_dofs",
+    "actuator_gravcomp_dofs",
+    "compensated_mass",
     "body_mocap",
     "geom_bodyid",
     "tendon_range",
@@ -464,7 +465,7 @@ MJ_DTYPE = np.dtype(
     [
         (name, "<i8")
         for name in (
-            *("model", "data", "warnings", "gainprm", "biasprm", "enableflags"),
+            *("model", "data", "warnings", "gainprm", "biasprm", "enableflags", "gravity"),
             *_DATA_ARRAYS,
             *_DATA_FIELDS,
             *_OWNED,
@@ -499,22 +500,24 @@ def model_addresses(
     values |= {name: getattr(data, name).ctypes.data for name in _DATA_ARRAYS}
     values |= {name: field_address(data, name) for name in _DATA_FIELDS}
     values["warnings"] = field_address(data, "warning")
-    options = struct_of("mjModel").opt.offset + struct_of("mjOption").enableflags.offset
-    values["enableflags"] = model_address + options
+    options = model_address + struct_of("mjModel").opt.offset
+    for name in ("enableflags", "gravity"):
+        values[name] = options + getattr(struct_of("mjOption"), name).offset
     values["gainprm"] = model.actuator_gainprm.ctypes.data
     values["biasprm"] = model.actuator_biasprm.ctypes.data
     values |= {name: getattr(model, name) for name in _SIZES}
     values |= {f"contact_{name}": value for name, value in contact_layout().items()}
-    values["has_gravity_compensation"] = bool(np.any(model.body_gravcomp))
+    values["has_gravity_compensation"] = _has_gravity_compensation(model)
     values["has_tendons_or_flexes"] = model.ntendon > 0 or model.nflex > 0
     values["is_discrete"] = model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
     # a flex may take more rows than 6 per equality, as many as it has now
     values["equality_capacity"] = max(6 * model.neq, data.ne)
 
     # actgravcomp hands a joint's gravity compensation to its actuators; the rest is passive
-    passive = 1.0 - model.jnt_actgravcomp[model.dof_jntid].astype(np.float64)
+    by_actuator = model.jnt_actgravcomp[model.dof_jntid]
     owned: dict[str, NDArray[np.generic]] = {
-        "passive_gravcomp_dofs": np.ascontiguousarray(passive, dtype=np.float64),
+        "actuator_gravcomp_dofs": np.ascontiguousarray(by_actuator, dtype=np.float64),
+        "compensated_mass": np.asarray(model.body_gravcomp * model.body_mass),
         # a body that is fixed or jointed to a mocap body moves with it
         "body_mocap": np.ascontiguousarray(model.body_mocapid[model.body_rootid], dtype=np.int32),
         "geom_bodyid": np.ascontiguousarray(model.geom_bodyid, dtype=np.int32),
@@ -532,6 +535,14 @@ def model_addresses(
         "dof_turns": _turning_dofs(model),
     }
     return values, owned
+
+
+def _has_gravity_compensation(model: mujoco.MjModel) -> bool:
+    """Returns True if MuJoCo computes gravity compensation."""
+    disabled, flags = model.opt.disableflags, mujoco.mjtDisableBit
+    passive = flags.mjDSBL_SPRING | flags.mjDSBL_DAMPER  # without both it skips passive forces
+    is_off = disabled & flags.mjDSBL_GRAVITY or disabled & passive == passive
+    return bool(model.ngravcomp) and not is_off
 
 
 def _masses_of_free_trees(model: mujoco.MjModel) -> NDArray[np.float64]:

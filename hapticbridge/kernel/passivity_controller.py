@@ -12,7 +12,7 @@ import numpy as np
 
 from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, Part, State
 from hapticbridge.kernel.hand_energy import INSTANT
-from hapticbridge.kernel.jit import compiled, source_of
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import held_energy, pulled
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, GuardParameters
 from hapticbridge.kernel.pose import Vector, norm, scaled
@@ -57,14 +57,20 @@ OBSERVER_DTYPE = np.dtype(
         ("guarded_energy", "<f8"),
         ("max_guarded_energy", "<f8"),
         ("hand_energy", "<f8"),
+        ("max_hand_energy", "<f8"),
         ("springs", "<f8"),
         ("max_unpaid_energy", "<f8"),
         ("first_unpaid", "<i8"),
         ("created_energy", "<f8"),
         ("previous_created", "<f8"),
         ("previous_net_storage", "<f8"),
+        ("released", "<f8"),
         ("pushed", "<f8"),
-        ("previous_pushes", "<f8"),
+        ("input_work", "<f8"),
+        ("peak_motor_work", "<f8"),
+        ("peak_input_work", "<f8"),
+        ("previous_motor_work", "<f8"),
+        ("previous_external_work", "<f8"),
         ("previous_environment", "<f8"),
         ("work_at_reset", "<f8"),
         ("is_reset", "<i8"),
@@ -77,12 +83,14 @@ OBSERVER_DTYPE = np.dtype(
 )
 """Sub-record ``observer``, written by this module alone; symbols in ``observe_energy``. Dampings in
 N s/m and N m s/rad, energies in J, velocities in m/s and rad/s. ``max_guarded_energy`` is the
-largest ``guarded_energy`` so far. ``hand_energy`` is Σ (w·δp − b ‖δp‖²/t − W_u), ``springs`` the
-energy of the coupling's springs at the start and after each reset, ``max_unpaid_energy`` the
-largest unpaid energy (``hand_energy.HandEnergy``), ``first_unpaid`` the first tick in which it was
-more than ``hand_energy.INSTANT``, −1 for none. ``pushed`` is m of ``released_energy``, with the
-ports' works and Σ E one tick before, W_c at the last reset, and 1 in the tick after it.
-``reversals`` holds one bit per tick."""
+largest ``guarded_energy`` so far. ``hand_energy`` is Σ (w·δp − b ‖δp‖²/t − W_u) with its largest
+value, ``springs`` the energy of the coupling's springs at the start and after each reset,
+``max_unpaid_energy`` the largest unpaid energy (``hand_energy.HandEnergy``), ``first_unpaid`` the
+first tick in which it was more than ``hand_energy.INSTANT``, −1 for none. ``released`` and
+``pushed`` are R and m of ``observe_release``; ``input_work`` is the external work without that of
+resets. ``peak_*`` are the works of largest size, ``previous_*`` those and Σ E one tick before;
+``work_at_reset`` is W_c at the last reset, ``is_reset`` 1 in the tick after it. ``reversals`` holds
+one bit per tick."""
 
 
 def bind_observer(observer: Part, guarding: GuardParameters) -> None:
@@ -103,54 +111,51 @@ def credit_springs(s: State) -> None:
     s.observer.springs += held_energy(s, stretch, twist)
 
 
-def observe_reset(s: State, stored_before: float) -> None:
+def observe_reset(s: State) -> None:
     """Accounts for a reset of the scene: storage that it replaced pays for no energy to the device.
 
-    Args:
-        s: The bound state with the energies after the reset.
-        stored_before: Storage before the reset in J.
+    Must run before the first tick after the reset.
     """
-    energy, observer = s["energy"], s["observer"]
+    observer = s["observer"]
     ratio = float(s["run"]["force_scale"] / s["run"]["scale"])
-    released = source_of(released_energy)(observer, energy, stored_before)
-    observer["net_device_energy"] -= ratio * released
-    observer["work_at_reset"], observer["pushed"] = energy["coupling_work"], 0.0
+    observer["net_device_energy"] -= ratio * observer["released"]
+    observer["work_at_reset"] = s["energy"]["coupling_work"]
+    observer["released"] = observer["pushed"] = 0.0
     observer["is_reset"] = 1
 
 
 @compiled
-def released_energy(observer: Part, energy: Part, stored: float) -> float:
-    """Returns the energy in J that the scene's storage has given to the hand since the start.
+def observe_release(s: State) -> None:
+    """Updates the energy R in J that the scene's storage has given to the hand since the start.
 
         R = max(min(−W_c − m, S_0 − S), 0),    m_k = max(m_{k−1} + δW_p + min(E_k, 0), 0)
 
     W_c is the coupling's work on the scene since the start or reset, S the scene's storage less the
     work of the other hands. m is what motors and inputs have done and the scene has not burned; W_p
-    are their works, E_k the created energy of tick k, negative if it is burned. So what bodies lose
-    beside the tool, as one that falls to the floor, hides no motor. A body that burns energy while
-    a motor pushes hides it, by no more than what the scene has lost.
+    are their works, without that of a reset. E_k is the created energy of tick k, negative if it is
+    burned. So what bodies lose beside the tool, as one that falls to the floor, hides no motor that
+    pushes later. A body that loses energy while a motor pushes hides it, by no more than what the
+    scene has lost: S is the storage of all bodies together.
 
-    Args:
-        observer: This module's sub-record.
-        energy: The ledger's sub-record.
-        stored: Storage in J, kinetic and potential energy.
+    Must run at the end of each tick, when its energy is balanced.
     """
-    lost = energy["start_energy"] + energy["others_work"] - stored
-    given = observer["work_at_reset"] - energy["coupling_work"] - observer["pushed"]
-    return float(max(min(given, lost), 0.0))
-
-
-@compiled
-def _note_pushes(s: State) -> None:
-    """Updates m of ``released_energy`` by the previous tick; a reset's own work is left out."""
     observer, energy = s.observer, s.energy
-    pushes = energy.actuator_work + energy.external_work
+    motors, inputs = energy.actuator_work, energy.external_work
     if observer.is_reset == 0:
+        observer.input_work += inputs - observer.previous_external_work
+        pushed = motors - observer.previous_motor_work + inputs - observer.previous_external_work
         burned = min(energy.environment_energy - observer.previous_environment, 0.0)
-        pushed = observer.pushed + (pushes - observer.previous_pushes) + burned
-        observer.pushed = max(pushed, 0.0)
+        observer.pushed = max(observer.pushed + pushed + burned, 0.0)
     observer.is_reset = 0
-    observer.previous_pushes, observer.previous_environment = pushes, energy.environment_energy
+    observer.previous_motor_work, observer.previous_external_work = motors, inputs
+    observer.previous_environment = energy.environment_energy
+    if abs(motors) > abs(observer.peak_motor_work):
+        observer.peak_motor_work = motors
+    if abs(observer.input_work) > abs(observer.peak_input_work):
+        observer.peak_input_work = observer.input_work
+    lost = energy.start_energy + energy.others_work - (energy.kinetic + energy.potential)
+    given = observer.work_at_reset - energy.coupling_work - observer.pushed
+    observer.released = max(min(given, lost), 0.0)
 
 
 @compiled
@@ -159,12 +164,11 @@ def guarded_energy(s: State) -> float:
 
         G − q R,    q = force_scale / scale
 
-    G is the sum of w·δp − b ‖δp‖²/t in J, R is ``released_energy``: what the scene's storage has
-    given is not energy from nowhere.
+    G is the sum of w·δp − b ‖δp‖²/t in J. What the scene's storage has given, R of
+    ``observe_release``, is not energy from nowhere.
     """
-    stored = s.energy.kinetic + s.energy.potential
-    released = released_energy(s.observer, s.energy, stored)
-    return float(s.observer.net_device_energy - s.run.force_scale / s.run.scale * released)
+    ratio = s.run.force_scale / s.run.scale
+    return float(s.observer.net_device_energy - ratio * s.observer.released)
 
 
 @compiled
@@ -251,6 +255,7 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
         ``created_energy``: Σ E_k of the environment minus its slack, and at least −A_max.
         ``guarded_energy``: result of the function of that name. If a motor in the scene
         pushes the hand, that energy counts as excess, and so does unfelt work.
+        ``max_hand_energy``: largest Σ (w·δp − b ‖δp‖²/t − W_u).
         ``max_unpaid_energy``: largest Σ (w·δp − b ‖δp‖²/t − W_u) − q max(V_0 − W_c − P, 0), with
         the springs' energy V_0, the coupling's work W_c and P = max(Σ E, 0).
 
@@ -292,12 +297,12 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     observer.observed_energy = max(observer.observed_energy + delivered + gained, -limit)
     observer.net_device_energy += delivered
     observer.hand_energy += delivered - unfelt
+    observer.max_hand_energy = max(observer.max_hand_energy, observer.hand_energy)
     released = observer.springs - max(energy.environment_energy, 0.0) - energy.coupling_work
     paid = (s.run.force_scale / s.run.scale) * max(released, 0.0)
     observer.max_unpaid_energy = max(observer.max_unpaid_energy, observer.hand_energy - paid)
     if observer.first_unpaid < 0 and observer.max_unpaid_energy > INSTANT:
         observer.first_unpaid = s.loop.tick
-    _note_pushes(s)
     observer.guarded_energy = guarded_energy(s)
     observer.max_guarded_energy = max(observer.max_guarded_energy, observer.guarded_energy)
     for i in range(6):

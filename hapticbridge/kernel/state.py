@@ -316,7 +316,7 @@ class BoundKernel:
         direct(refresh_energies, s)(s)
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         add_reset_work(s["energy"], after - before)
-        observe_reset(s, before)
+        observe_reset(s)
         direct(credit_springs, s)(s)
         if self._loop is None:
             let_go(s["guard"])

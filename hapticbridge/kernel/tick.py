@@ -121,6 +121,7 @@ from hapticbridge.kernel.passivity_controller import (
     control,
     foreseen_excess,
     observe_energy,
+    observe_release,
     within_energy_limit,
 )
 from hapticbridge.kernel.pose import (
@@ -615,6 +616,8 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
         is_finite = judge_balance(state[i]) and is_finite
     if not is_finite:
         return refuse_tick(state, BAD_RESULT)
+    for i in range(state.size):
+        observe_release(state[i])
     fill_tank(s)
     if has_positions and not is_sound(s):
         loop.has_positions = 0

@@ -35,6 +35,7 @@ from hapticbridge.errors import (
 )
 from hapticbridge.files import read_json
 from hapticbridge.kernel.codes import CLUTCHED, FORCE_OFF
+from hapticbridge.kernel.ledger import take_scene_works
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.run.description import restore_state
@@ -577,6 +578,8 @@ class EventApplier:
             self._slow.bound.handle_reset()
         for bound, _ in self._hands:
             bound.handle_reset()
+            if self._slow is not None:
+                take_scene_works(bound.state["energy"], self._slow.bound.state["energy"])
 
     def write(self, writes: Sequence[Sequence[Any]]) -> None:
         """Applies the writes of an event ``input`` (``inputs.input_writes``).

@@ -66,7 +66,7 @@ from hapticbridge.run.hands import DeviceGroup
 from hapticbridge.run.options import RunSetup
 from hapticbridge.run.request import RunRequest
 from hapticbridge.run.slow_scene import LONGEST_WAIT, SlowScene
-from hapticbridge.run.summary import RunOutcome, Summary
+from hapticbridge.run.summary import RunOutcome, Summary, hand_energy
 from hapticbridge.scene.checks import first_pump, strongest_actuator
 from hapticbridge.scene.inputs import Write
 from hapticbridge.signals import deferring_stops
@@ -596,15 +596,15 @@ class Session:
         self.event("trip", **found.details())
         self._before_trip = self.stream.latest(1)  # the ring is closed before the summary
         trip = SafetyTrip(found.sentence, self.stream.latest(round(1.0 / self.setup.period)))
-        work, inputs, created = (
-            float(trip.records[name][-1]) if len(trip.records) else 0.0
-            for name in ("actuator_work", "external_work", "environment_energy")
-        )
+        created = float(self.kernel.state["energy"]["environment_energy"][0])
+        hands = enumerate(self.hand_parameters)
+        energies = (hand_energy(self.kernel.state[i : i + 1], own) for i, own in hands)
+        energy = max(energies, key=lambda each: each.net)
         model, data = self.setup.scene.model, self.setup.scene.data
         pump = first_pump(model) if found.may_be_pumped else None
         if pump is not None:
             trip.add_note(f"{pump.words}; write {pump.change}")
-        elif remedy := found.remedy(work, created, strongest_actuator(model, data), inputs):
+        elif remedy := found.remedy(energy, created, strongest_actuator(model, data)):
             trip.add_note(remedy)
         return trip
 

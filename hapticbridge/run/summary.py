@@ -28,10 +28,8 @@ from hapticbridge.demand.trip import Trip
 from hapticbridge.device import DeviceInfo
 from hapticbridge.kernel.codes import Grip, Scheme, coupling_ids, held_body
 from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
-from hapticbridge.kernel.jit import source_of
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.passivity_controller import released_energy
 from hapticbridge.kernel.record import TickFlag
 from hapticbridge.units import energy_rows, format_share, format_si, format_wrenches
 
@@ -81,10 +79,10 @@ class Ledger:
 
     Attributes:
         kinetic: Present kinetic energy.
-        potential: Present potential energy of gravity and springs.
+        potential: Present potential energy of gravity, its compensation, and springs.
         coupling_work: Work of the coupling on the tool, Σ f_k·δx_k + τ_k·δφ_k.
         actuator_work: Work of the scene's own actuators.
-        external_work: Work of applied forces, gravity compensation, moved mocap bodies and resets.
+        external_work: Work of applied forces, moved mocap bodies and resets.
         environment_energy: Σ E_k: energy created (> 0) or dissipated (< 0) by the simulation.
         device_energy: Energy given to the device by the wrenches sent.
         slack: Bound of Σ E_k up to which the guarantee holds.
@@ -268,9 +266,7 @@ class Summary:
         """Returns the summary with the energies of a tick's record."""
         names = record.dtype.names or ()
         found = {name: float(record[name]) for name in self.energies if name in names}
-        works = {"motors": found["actuator_work"], "inputs": found["external_work"]}
-        own = replace(self.certification, energy=replace(self.hand_energy, **works))
-        return replace(self, energies=self.energies | found, certification=own)
+        return replace(self, energies=self.energies | found)
 
     @staticmethod
     def of_hands(hands: tuple[Summary, ...]) -> Summary:
@@ -451,7 +447,7 @@ class Summary:
             silent_tick=int(state["guard"]["silent_tick"][0]),
         )
         peaks: dict[str, Any] = {name: float(state["loop"][name][0]) for name in _PEAKS}
-        hand = HandEnergy() if info.is_prescribed else _hand_energy(state, parameters)
+        hand = HandEnergy() if info.is_prescribed else hand_energy(state, parameters)
         certification = certification_of(info, parameters, method, times, hand)
         return cls(
             ticks=outcome.ticks,
@@ -505,17 +501,16 @@ def _fault(
     return min((unpaid, "device"), ledger.fault or (unpaid, "device"))
 
 
-def _hand_energy(state: NDArray[np.void], parameters: RunParameters) -> HandEnergy:
+def hand_energy(state: NDArray[np.void], parameters: RunParameters) -> HandEnergy:
     """Reads the energy of a hand from the kernel's state."""
-    observer, energy = state["observer"][0], state["energy"][0]
+    observer = state["observer"][0]
     ratio = parameters.force_scale / parameters.scale
     return HandEnergy(
         net=float(observer["max_guarded_energy"]),
         unpaid=float(observer["max_unpaid_energy"]),
         springs=ratio * float(observer["springs"]),
-        scene=source_of(released_energy)(
-            observer, energy, float(energy["kinetic"] + energy["potential"])
-        ),
-        motors=float(energy["actuator_work"]),
-        inputs=float(energy["external_work"]),
+        scene=float(observer["released"]),
+        motors=float(observer["peak_motor_work"]),
+        inputs=float(observer["peak_input_work"]),
+        gross=float(observer["max_hand_energy"]),
     )

@@ -274,7 +274,7 @@ class Scene:
         """Compensates the weight of all that moves with the grip (MuJoCo's ``gravcomp``).
 
         ``model`` and ``data`` are replaced, and the change is noted with its reason. Inertia,
-        contacts and motors stay. The compensation's work is metered at the external port.
+        contacts and motors stay. A carried weight stores no energy.
 
         Raises:
             SceneError: The scene was not made by ``load_scene``.
