@@ -213,7 +213,7 @@ class OnItsStop:
 
 
 class BetweenStops:
-    """Handle on a rail with a stop on each side, against which a hand shakes it; its motor is right.
+    """Handle on a rail that a hand shakes against a stop on each side; its motor is right.
 
     Args:
         stop: Place in m, stiffness in N/m and damping in N s/m of each stop.
