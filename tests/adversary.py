@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import method_named, prepare
 from hapticbridge.kernel.codes import BAD_RESULT, CLUTCHED, FORCE_OFF, OK
-from hapticbridge.kernel.jit import compiled
+from hapticbridge.kernel.jit import compiled, direct
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.state import BoundKernel
@@ -45,6 +45,11 @@ UNPAID = 1e-6
 """Largest energy in J that a hand may have beyond what it put in; rounding leaves less."""
 
 HANDS = 5
+"""Number of kinds of hands."""
+
+WANDERS, SHAKES, TREMBLES = 0, 3, 4
+"""Kinds of hands that do not stretch the coupling and then follow."""
+
 CHUNK = 50
 """Ticks between two decisions of the hand about buttons and coupling."""
 
@@ -89,7 +94,11 @@ def _turn(q: NDArray[np.float64], turn: NDArray[np.float64]) -> None:
 
 @compiled
 def _move(
-    h: Any, w: NDArray[np.float64], habits: NDArray[np.float64], period: float, rng: Any
+    h: Any,
+    w: NDArray[np.float64],
+    habits: NDArray[np.float64],
+    period: float,
+    normals: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns the next step in m and rotation vector in rad; ``habits`` as in ``_attack``."""
     axes, kind, b, b_r = int(habits[0]), int(habits[1]), habits[2], habits[3]
@@ -97,22 +106,21 @@ def _move(
     push, hold, follow = int(habits[9]), int(habits[10]), int(habits[11])
     d, t = np.zeros(3), np.zeros(3)
     step = h.tick % (push + hold + follow)
-    if kind == 0:  # wanders
+    if kind == WANDERS:
         for i in range(6):
             fresh = 0.05 * speed if i < 3 else 0.3
-            h.velocity[i] = 0.98 * h.velocity[i] + fresh * rng.standard_normal()
+            h.velocity[i] = 0.98 * h.velocity[i] + fresh * normals[i]
         d[:], t[:] = h.velocity[:3] * period, h.velocity[3:] * period
-    elif kind == 3:  # shakes at one frequency
+    elif kind == SHAKES:  # at one frequency
         angle = 2.0 * np.pi * h.tick / (push + hold)
         d[:] = 1e-3 * speed * np.array([np.sin(angle), np.cos(1.3 * angle), np.sin(0.7 * angle)])
         t[:] = 2e-3 * np.array([np.cos(angle), np.sin(1.1 * angle), np.cos(0.9 * angle)])
-    elif kind == 4:  # trembles without memory
+    elif kind == TREMBLES:  # without memory
         for i in range(3):
-            d[i], t[i] = 1e-3 * speed * rng.standard_normal(), 5e-3 * rng.standard_normal()
+            d[i], t[i] = 1e-3 * speed * normals[2 * i], 5e-3 * normals[2 * i + 1]
     elif step < push:  # stretches, waits, then follows the force (1), or the tool alone (2)
         if step == 0:
-            for i in range(6):
-                h.velocity[i] = rng.standard_normal()
+            h.velocity[:] = normals
             h.velocity[min(axes, 3) : 3] = 0.0
             h.velocity[:3] *= speed / np.sqrt(np.sum(h.velocity[:3] ** 2))
         d[:], t[:] = h.velocity[:3] * period, h.velocity[3:] * period
@@ -127,66 +135,86 @@ def _move(
 
 
 @compiled
-def _attack(
+def _move_device(
     state: NDArray[np.void],
     sample: NDArray[np.void],
-    row: NDArray[np.void],
     hand: NDArray[np.void],
-    scene: tuple[NDArray[np.void], NDArray[np.void], NDArray[np.void]],
     habits: NDArray[np.float64],
-    rng: Any,
+    normals: NDArray[np.float64],
+    elapsed: float,
+) -> None:
+    """Moves the device for a time in s; ``normals`` are six numbers of a normal distribution."""
+    s, h = state[0], hand[0]
+    period, b, b_r = s.run.period, habits[2], habits[3]
+    w = np.zeros(6)
+    w[:] = s.loop.wrench_on_device
+    _shorten(w[:3], habits[4])
+    _shorten(w[3:], habits[5])
+    d, t = _move(h, w, habits, period, normals)
+    d *= elapsed / period
+    t *= elapsed / period
+    _shorten(d, FASTEST * elapsed)
+    _shorten(t, FASTEST_TURN * elapsed)
+    h.net += np.sum((w[:3] - b / elapsed * d) * d) + np.sum((w[3:] - b_r / elapsed * t) * t)
+    h.position[:] += d
+    _turn(h.quaternion, t)
+    sample[0].buttons = int(habits[6])
+    for i in range(3):
+        sample[0].position[i] = h.position[i]
+    for i in range(4):
+        sample[0].quaternion[i] = h.quaternion[i]
+
+
+@compiled
+def _account(state: NDArray[np.void], hand: NDArray[np.void]) -> None:
+    s, h = state[0], hand[0]
+    released = min(s.energy.kinetic + s.energy.potential - s.energy.start_energy, 0.0)
+    # a force that was held too long may have given more than its spring held; that is owed
+    owed = s.coupling.owed[0] + s.coupling.owed[1]
+    h.most = max(h.most, h.net + s.run.force_scale / s.run.scale * (released - owed))
+    h.saturated += s.level.flags != 0
+    h.tick += 1
+
+
+def _attack(
+    states: tuple[NDArray[np.void], NDArray[np.void]],
+    own: tuple[NDArray[np.void], NDArray[np.void], NDArray[np.void]],
+    hand: NDArray[np.void],
+    habits: NDArray[np.float64],
+    rng: np.random.Generator,
 ) -> int:
     """Runs a chunk; returns the code of the first tick that was refused, else ``OK``.
 
+    ``states`` and ``own`` as for ``shown_tick``; three steps in ten of a slower scene come late.
     ``habits``: count of axes, kind of hand, b, b_r, limit of force and torque in N and N m that
     only the device applies, buttons, speed in m/s, share of the speed w/b at which it follows,
     ticks of pushing, waiting and following, periods by which three samples in ten are late, ticks
-    per step of the scene. ``scene``: state, record and sample of a scene slower than the loop, of
-    which three steps in ten come late.
+    per step of the scene.
     """
-    s, h = state[0], hand[0]
-    period, late = s.run.period, habits[12]
-    b, b_r = habits[2], habits[3]
-    w = np.zeros(6)
-    for _ in range(CHUNK):
-        w[:] = s.loop.wrench_on_device
-        _shorten(w[:3], habits[4])
-        _shorten(w[3:], habits[5])
-        d, t = _move(h, w, habits, period, rng)
+    state, sample, normals = states[0], np.zeros(1, SAMPLE_DTYPE), np.zeros(6)
+    kind, late, scene_ticks = int(habits[1]), habits[12], int(habits[13])
+    period, cycle = float(state[0]["run"]["period"]), int(habits[9:12].sum())
+    move = direct(_move_device, state, sample, hand, habits, normals, period)
+    account = direct(_account, state, hand)
+    first, due = int(hand[0]["tick"]), int(hand[0]["due"])
+    for tick in range(first, first + CHUNK):
+        if kind in (WANDERS, TREMBLES) or (kind != SHAKES and tick % cycle == 0):
+            normals[:] = rng.standard_normal(6)
         elapsed = period
         if late > 0.0 and rng.random() < 0.3:
             elapsed *= 1.0 + late * rng.random()
-            d *= elapsed / period
-            t *= elapsed / period
-        _shorten(d, FASTEST * elapsed)
-        _shorten(t, FASTEST_TURN * elapsed)
-        h.net += np.sum((w[:3] - b / elapsed * d) * d) + np.sum((w[3:] - b_r / elapsed * t) * t)
-        h.position[:] += d
-        _turn(h.quaternion, t)
-        sample[0].buttons = int(habits[6])
-        for i in range(3):
-            sample[0].position[i] = h.position[i]
-        for i in range(4):
-            sample[0].quaternion[i] = h.quaternion[i]
-        if habits[13] == 0.0:
-            is_done = whole_tick(state, sample, row, elapsed)
+        move(state, sample, hand, habits, normals, elapsed)
+        if scene_ticks == 0:
+            is_done = whole_tick(state, sample, own[0], elapsed)
         else:
-            slow, slow_row, given = scene
-            is_due = h.tick >= h.due
-            own = row, slow_row, given
-            is_done = shown_tick((state, slow), own, sample, elapsed, is_due)
-            if is_due:
-                h.due = h.tick + int(habits[13])
-            if is_due and rng.random() < 0.3:
-                h.due += int(habits[13] * rng.random())
+            is_done = shown_tick(states, own, sample, elapsed, tick >= due)
+            if tick >= due:
+                due = tick + scene_ticks
+                due += int(scene_ticks * rng.random()) if rng.random() < 0.3 else 0
         if not is_done:
             return BAD_RESULT
-        released = min(s.energy.kinetic + s.energy.potential - s.energy.start_energy, 0.0)
-        # a force that was held too long may have given more than its spring held; that is owed
-        owed = s.coupling.owed[0] + s.coupling.owed[1]
-        h.most = max(h.most, h.net + s.run.force_scale / s.run.scale * (released - owed))
-        h.saturated += s.level.flags != 0
-        h.tick += 1
+        account(state, hand)
+    hand["due"] = due
     return OK
 
 
@@ -285,8 +313,8 @@ class Attack:
             slow = BoundKernel(scene.model, scene.data, parameters.of_scene, kernel)
         if not self.pays:
             kernel.state["shown"]["tank"] = kernel.state["shown"]["passing"] = 1e9
-        parts = slow.state, slow.row, np.zeros(1, SAMPLE_DTYPE)
-        hand, sample = np.zeros(1, HAND_DTYPE), np.zeros(1, SAMPLE_DTYPE)
+        states, own = (kernel.state, slow.state), (kernel.row, slow.row, np.zeros(1, SAMPLE_DTYPE))
+        hand = np.zeros(1, HAND_DTYPE)
         hand["quaternion"][0, 0] = 1.0
         times = 10 ** rng.uniform([-2.7, -2.7, -1.5], [-0.7, -0.7, 0.3]) / period
         habits = np.array(
@@ -319,7 +347,7 @@ class Attack:
                 if self.scene_ticks:
                     ticks = max(round(0.02 / step), 1)
                     slow.tune(goal.of_scene, method.gains(law, step), ticks)
-            code = _attack(kernel.state, sample, kernel.row, hand, parts, habits, draw)
+            code = _attack(states, own, hand, habits, draw)
             if code != OK:
                 break
         return float(hand["most"][0]), int(hand["saturated"][0]), code

@@ -167,6 +167,11 @@ SHEET = DeviceInfo(
 )
 
 
+def stroke(tick: int) -> tuple[float, ...]:
+    """A hand that swings by 25 mm, at most at 0.5 m/s, and presses the wall at its second turn."""
+    return (0.025 * np.sin(0.02 * tick), 0, 0, 1, 0, 0, 0)
+
+
 class AnsweringDevice:
     """A device on the x axis whose hand answers the force that it was sent.
 

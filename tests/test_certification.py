@@ -35,7 +35,6 @@ SHEETS: dict[Standing, tuple[dict[str, Any], Coupling | None, str]] = {
     ),
     Standing.DAMPING_UNKNOWN: ({"damping": None, "rotational_damping": None}, None, ""),
     Standing.DELAY_UNKNOWN: ({"delay": None}, None, ""),
-    Standing.LATE: ({"delay": 1e-3, "damping": 40.0}, None, ""),
     Standing.NO_HAND: ({"is_prescribed": True}, None, ""),
 }
 
@@ -54,6 +53,16 @@ def test_run_and_audit_reach_one_verdict_with_one_reason(
     assert reason in report.reason
     assert summary.verdict == report.verdict == "passive"
     assert report.exit_code == (standing.verdict is False)
+
+
+def test_a_late_device_that_has_the_damping_is_certified_for_its_delay(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    summary = recorded(path, "point_mass", ScriptedDevice(sway, delay=1.5e-3), duration=0.1)
+    words = "b >= what its delay needs, if its forces come 1.5 ms after their samples"
+    for found in (summary.certification, audit(path).certification):
+        assert found is not None
+        assert found.standing is Standing.CERTIFIED
+        assert found.words == f"device certified: {words}"
 
 
 def test_a_late_device_that_lacks_damping_is_told_the_number_of_its_own_bound(

@@ -22,14 +22,12 @@ from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
 from hapticbridge.kernel.pose import (
     dot,
-    norm,
     product,
     quaternion_exp,
     quaternion_of,
     rotation_between,
     scaled,
     store_quaternion,
-    store_vector,
     vector_of,
 )
 from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
@@ -89,20 +87,49 @@ def stored(state: NDArray[np.void], row: NDArray[np.void]) -> float:
 
 
 @compiled
-def hold(
-    state: NDArray[np.void],
+def swing(
     sample: NDArray[np.void],
     row: NDArray[np.void],
+    hand: tuple[float, float, float, float],
+    w: NDArray[np.float64],
+    net: float,
+) -> float:
+    """Moves a hand for a tick in leapfrog steps, with the damper implicit.
+
+    ``w`` is its speed in rad/s; other arguments as for ``hold``. Returns ``net`` and the energy
+    in J that the hand got in this tick beyond what b_r burned.
+    """
+    inertia, b_r, spring, angle = hand
+    h = T / SUBSTEPS
+    rest = (math.cos(0.5 * angle), math.sin(0.5 * angle), 0.0, 0.0)
+    pose, torque = quaternion_of(sample[0].quaternion), vector_of(row[0].wrench_on_device[3:6])
+    for _ in range(SUBSTEPS):
+        pull = rotation_between(pose, rest)
+        for i in range(3):
+            w[i] += 0.5 * h / inertia * (torque[i] + spring * pull[i] - b_r * w[i])
+        turn = scaled(h, vector_of(w))
+        pose = product(quaternion_exp(turn), pose)
+        net += dot(torque, turn) - b_r / h * dot(turn, turn)
+        pull = rotation_between(pose, rest)
+        for i in range(3):
+            w[i] += 0.5 * h / inertia * (torque[i] + spring * pull[i])
+            w[i] /= 1.0 + 0.5 * h * b_r / inertia
+    store_quaternion(sample[0].quaternion, pose)
+    return net
+
+
+def hold(
+    kernel: BoundKernel,
+    sample: NDArray[np.void],
     hand: tuple[float, float, float, float],
     knock: float,
     ticks: int,
 ) -> tuple[float, float]:
     """Lets a hand hold the device by a torsion spring, and knocks it in tick 10.
 
-    The hand's motion within a tick is integrated in leapfrog steps, with the damper implicit.
-
     Args:
-        state, sample, row: Of the bound kernel; the sample has the device's pose.
+        kernel: The bound kernel.
+        sample: The device's pose.
         hand: Inertia in kg m², damping b_r, spring in N m/rad, angle at which it rests in rad.
         knock: Change of its speed across the twist, in rad/s.
         ticks: Length of the run.
@@ -111,35 +138,20 @@ def hold(
         Largest speed in the last 100 ticks in rad/s, and the most energy in J that the hand had
         beyond what it put in, what b_r burned, and what spring and scene gave up.
     """
-    inertia, b_r, spring, angle = hand
-    h = T / SUBSTEPS
-    rest = (math.cos(0.5 * angle), math.sin(0.5 * angle), 0.0, 0.0)
-    pose = quaternion_of(sample[0].quaternion)
-    w, torque = np.zeros(3), np.zeros(3)
-    net, start, most, fastest = 0.0, 0.0, -np.inf, 0.0
+    state, row = kernel.state, kernel.row
+    w, net, start, most, fastest = np.zeros(3), 0.0, 0.0, -np.inf, 0.0
     for k in range(ticks):
         if k == 10:
             w[1] += knock
-        store_quaternion(sample[0].quaternion, pose)
         if not whole_tick(state, sample, row, T):
             return np.inf, np.inf
         if k == 1:  # the handle follows from the first tick on
             net, start = 0.0, stored(state, row)
-        most = max(most, net + stored(state, row) - start) if k > 0 else most
-        torque[:] = row[0].wrench_on_device[3:6]
-        for _ in range(SUBSTEPS):
-            pull = rotation_between(pose, rest)
-            for i in range(3):
-                w[i] += 0.5 * h / inertia * (torque[i] + spring * pull[i] - b_r * w[i])
-            turn = scaled(h, vector_of(w))
-            pose = product(quaternion_exp(turn), pose)
-            net += dot(vector_of(torque), turn) - b_r / h * dot(turn, turn)
-            pull = rotation_between(pose, rest)
-            for i in range(3):
-                w[i] += 0.5 * h / inertia * (torque[i] + spring * pull[i])
-                w[i] /= 1.0 + 0.5 * h * b_r / inertia
+        if k > 0:
+            most = max(most, net + stored(state, row) - start)
+        net = swing(sample, row, hand, w, net)
         if k >= ticks - 100:
-            fastest = max(fastest, norm(vector_of(w)))
+            fastest = max(fastest, float(np.linalg.norm(w)))
     return fastest, most
 
 
@@ -154,7 +166,7 @@ def knocked(pays: float | None) -> tuple[float, float]:
     sample["quaternion"] = [math.cos(twist / 2), math.sin(twist / 2), 0.0, 0.0]
     knock = math.radians(0.06) * math.sqrt((spring + stiffness) / 1e-6)
     hand = 1e-6, b_r, spring, twist * (1.0 + stiffness / spring)
-    return hold(kernel.state, sample, kernel.row, hand, knock, 1500)
+    return hold(kernel, sample, hand, knock, 1500)
 
 
 def test_a_knock_about_a_large_twist_decays_unless_the_midpoint_torque_is_not_paid_for() -> None:
@@ -170,10 +182,36 @@ def test_a_knock_about_a_large_twist_decays_unless_the_midpoint_torque_is_not_pa
 
 
 @compiled
-def circled(
-    state: NDArray[np.void],
+def lead(
     sample: NDArray[np.void],
     row: NDArray[np.void],
+    path: tuple[float, float, float, float],
+    device: tuple[float, float],
+    tick: int,
+    given: NDArray[np.float64],
+) -> float:
+    """Leads the device to its place in a tick; returns the time since the last one in s.
+
+    Arguments as for ``circled``. ``given`` counts the energy in J that the hand got beyond what
+    the device burned, and the energy that went to and fro.
+    """
+    (twist, radius, angle, share), (b_r, late) = path, device
+    at = (math.cos(0.5 * twist), math.sin(0.5 * twist), 0.0, 0.0)
+    size = radius * min(tick / 50.0, 1.0)
+    turn = (0.0, size * math.cos(angle * tick), share * size * math.sin(angle * tick))
+    pose = product(quaternion_exp(turn), at)
+    elapsed = T * (1.0 + late * (tick % 2))
+    step = rotation_between(quaternion_of(sample[0].quaternion) if tick > 0 else at, pose)
+    torque = vector_of(row[0].wrench_on_device[3:6])
+    work = dot(torque, step) - b_r / elapsed * dot(step, step)
+    given[0] += work
+    given[1] += abs(work)
+    store_quaternion(sample[0].quaternion, pose)
+    return elapsed
+
+
+def circled(
+    kernel: BoundKernel,
     path: tuple[float, float, float, float],
     device: tuple[float, float],
     dampings: NDArray[np.float64],
@@ -181,7 +219,7 @@ def circled(
     """Leads the device in a circle across its twist, each tick about one axis.
 
     Args:
-        state, sample, row: Of the bound kernel.
+        kernel: The bound kernel.
         path: Twist and radius in rad, angle of the circle per tick in rad, share of axis 2.
         device: Damping in N m s/rad, and periods by which every second sample is late.
         dampings: What may pay for the midpoint torque in each tick; below 0 as bound.
@@ -189,28 +227,20 @@ def circled(
     Returns:
         As the second result of ``hold``, and the energy in J that went to and fro.
     """
-    (twist, radius, angle, share), (b_r, late) = path, device
-    at = (math.cos(0.5 * twist), math.sin(0.5 * twist), 0.0, 0.0)
-    net, through, start, most, torque, last = 0.0, 0.0, 0.0, -np.inf, np.zeros(3), at
-    for k in range(dampings.size):
-        if dampings[k] >= 0.0:
-            state[0].coupling.twist_damping = dampings[k]
-        size = radius * min(k / 50.0, 1.0)
-        turn = (0.0, size * math.cos(angle * k), share * size * math.sin(angle * k))
-        pose = product(quaternion_exp(turn), at)
-        elapsed = T * (1.0 + late * (k % 2))
-        step = rotation_between(last, pose)
-        work = dot(vector_of(torque), step) - b_r / elapsed * dot(step, step)
-        net, through, last = net + work, through + abs(work), pose
-        store_quaternion(sample[0].quaternion, pose)
+    state, row, sample = kernel.state, kernel.row, np.zeros(1, SAMPLE_DTYPE)
+    owed, paying = state["coupling"]["owed"][0], state["coupling"]["twist_damping"]
+    given, start, most = np.zeros(2), 0.0, -np.inf
+    for k, damping in enumerate(dampings):
+        if damping >= 0.0:
+            paying[0] = damping
+        elapsed = lead(sample, row, path, device, k, given)
         if not whole_tick(state, sample, row, elapsed):
-            return np.inf, through
+            return np.inf, given[1]
         if k == 1:
-            net, start = 0.0, stored(state, row)
-        owed = state[0].coupling.owed[1]
-        most = max(most, net + stored(state, row) - start - owed) if k > 0 else most
-        store_vector(torque, vector_of(row[0].wrench_on_device[3:6]))
-    return most, through
+            given[0], start = 0.0, stored(state, row)
+        if k > 0:
+            most = max(most, given[0] + stored(state, row) - start - owed[1])
+    return most, given[1]
 
 
 def wobble(
@@ -235,7 +265,6 @@ def wobble(
         rest = -stiffness * twist / spring  # the spring holds the tool upright
         scene.model.qpos_spring[:4] = [math.cos(rest / 2), math.sin(rest / 2), 0.0, 0.0]
     kernel = twisted(scene, law, twist, b_r, math.inf if is_whole else None)
-    sample = np.zeros(1, SAMPLE_DTYPE)
     dampings = b_r * rng.random(800) if is_random else np.full(800, -1.0)
     path = (
         twist,
@@ -243,7 +272,7 @@ def wobble(
         rng.uniform(-np.pi, np.pi),
         float(rng.choice([1.0, 0.6])),
     )
-    return circled(kernel.state, sample, kernel.row, path, (b_r, late), dampings)
+    return circled(kernel, path, (b_r, late), dampings)
 
 
 @pytest.mark.parametrize(("is_random", "late"), [(False, 0.0), (True, 0.0), (False, 0.3)])
@@ -269,10 +298,7 @@ def test_up_to_the_twist_that_is_paid_for_the_torque_is_the_midpoint_one_to_the_
     found = []
     for pays in (None, math.inf, 0.0):
         kernel = twisted(load(TOOL.format(spring=1.0, inertia=1e-5)), law, twist, b_r, pays)
-        sample = np.zeros(1, SAMPLE_DTYPE)
-        circled(
-            kernel.state, sample, kernel.row, (twist, 0.1, 0.3, 0.5), (b_r, 0.0), np.full(300, -1.0)
-        )
+        circled(kernel, (twist, 0.1, 0.3, 0.5), (b_r, 0.0), np.full(300, -1.0))
         found.append(kernel.row.tobytes())
     assert found[0] == found[1] != found[2]
 

@@ -6,11 +6,15 @@ two samples by matrix exponentials, and the hand's energy is what it stores and 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from audit_cases import ScriptedDevice, SlowClock, recorded, stroke
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
@@ -141,55 +145,86 @@ def test_the_default_coupling_of_a_late_device_is_stiffer_than_a_walls_rule() ->
     assert stiffest_late_coupling(2.0, T, 0.0, 1) == pytest.approx((2400.0, 0.5), rel=1e-2)
 
 
-# In the product: a device that gives a sample every n ticks and holds the force of that tick
+# In the product: a device that gives a sample every n ticks, and holds its force from t_d on
 
 
-class SlowDevice:
+class OwnDevice:
     """A device of 1 axis in a hand of spring and damper, solved exactly between two ticks.
 
     ``gained`` is the largest energy in J that the hand stored and burned beyond its start's.
+
+    Args:
+        hand: Stiffness in N/m and damping in N s/m of the hand.
+        every: Ticks per sample; in the others the device holds its force.
+        late: Ticks from a sample to its force, by the sample's number; a part of one, too.
+        mass: Of hand and handle in kg.
+        start: Displacement in m and speed in m/s of the hand.
+        sheet: Fields of the data sheet.
     """
 
-    def __init__(self, every: int, stiffness: float, damping: float, *, rate: float) -> None:
-        self.info = DeviceInfo(
-            name="slow",
-            axes=("x", "y", "z"),
-            mass=0.1,
-            damping=2.0,
-            force_limit=10.0,
-            rate=rate,
-            delay=0.0,
-            is_real=False,
-        )
-        self.every, self.stiffness, self.damping = every, stiffness, damping
+    def __init__(
+        self,
+        hand: tuple[float, float],
+        *,
+        every: int = 1,
+        late: Callable[[int], float] = lambda _: 0.0,
+        mass: float = 0.1,
+        start: tuple[float, float] = (1e-3, 0.05),
+        **sheet: Any,
+    ) -> None:
+        usual: dict[str, Any] = {
+            "name": "own",
+            "axes": ("x", "y", "z"),
+            "mass": 0.1,
+            "damping": 2.0,
+            "delay": 0.0,
+        }
+        self.info = DeviceInfo(**usual | {"force_limit": 10.0, "is_real": False} | sheet)
+        self.every, self.late, self.mass, self._begin = every, late, mass, start
+        self.stiffness, self.damping = hand
         self.gained = 0.0
 
     def start(self, period: float) -> NDArray[np.void]:
-        mass, b = 0.1, 2.0 + self.damping
-        motion = np.array([[0, 1, 0], [-self.stiffness / mass, -b / mass, 1 / mass], [0, 0, 0]])
-        self._step = expm(motion * period)
-        # ∫ v² dt over a tick is a quadratic form in the state (Van Loan 1978)
-        square = np.diag([0.0, 1.0, 0.0])
-        block = expm(period * np.block([[-motion.T, square], [np.zeros((3, 3)), motion]]))
-        self._square = block[3:, 3:].T @ block[:3, 3:]
-        self._state = np.array([1e-3, 0.05, 0.0])  # displaced and moving
+        b = float(self.info.damping or 0.0) + self.damping
+        motion = [[0, 1, 0], [-self.stiffness / self.mass, -b / self.mass, 1 / self.mass]]
+        self._motion, self._period = np.array([*motion, [0, 0, 0]]), period
+        self._exact = cache(self._solved)
+        self._state = np.array([*self._begin, 0.0])  # displaced and moving
         self._start = self._stored()
         self._burned, self._ticks = 0.0, 0
-        self._next = np.zeros(3)
+        self._forces: list[tuple[float, float]] = []  # when they act, in ticks, and their size
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._sample["quaternion"][0, 0] = 1.0
         self._sample["position"][0, 0] = self._state[0]
         return self._sample
 
+    def _solved(self, share: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns the step of a share of a tick, and ∫ v² dt over it as a form of the state."""
+        time, square = share * self._period, np.diag([0.0, 1.0, 0.0])
+        # Van Loan 1978
+        blocks = [[-self._motion.T, square], [np.zeros((3, 3)), self._motion]]
+        block = expm(time * np.block(blocks))
+        return block[3:, 3:], block[3:, 3:].T @ block[:3, 3:]
+
     def _stored(self) -> float:
         x, v, _ = self._state
-        return 0.5 * 0.1 * float(v) ** 2 + 0.5 * self.stiffness * float(x) ** 2
+        return 0.5 * self.mass * float(v) ** 2 + 0.5 * self.stiffness * float(x) ** 2
+
+    def _move(self, share: float) -> None:
+        if share > 0.0:
+            step, square = self._exact(share)
+            self._burned += self.damping * float(self._state @ square @ self._state)
+            self._state = step @ self._state
 
     def read(self, sample: NDArray[np.void]) -> int:
-        self._burned += self.damping * float(self._state @ self._square @ self._state)
-        self._state = self._step @ self._state
-        self.gained = max(self.gained, self._stored() + self._burned - self._start)
+        now = float(self._ticks)
         self._ticks += 1
+        while self._forces and self._forces[0][0] < self._ticks:
+            at, force = self._forces.pop(0)
+            self._move(round(max(at - now, 0.0), 9))
+            now, self._state[2] = max(at, now), force
+        self._move(round(self._ticks - now, 9))
+        self.gained = max(self.gained, self._stored() + self._burned - self._start)
         is_new = self._ticks % self.every == 0
         if is_new:
             self._sample["position"][0, 0] = self._state[0]
@@ -198,15 +233,18 @@ class SlowDevice:
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         if self._ticks % self.every == 0:
-            self._state[2] = wrench[0]
+            self._forces.append((self._ticks + self.late(self._ticks), float(wrench[0])))
+            self._forces.sort(key=lambda each: each[0])
 
     def close(self) -> None:
         pass
 
 
-def run(device: SlowDevice, coupling: Coupling | None, file: Path | None = None) -> Summary:
-    options = {"clock": SimulatedClock(), "recording": file}
-    with Bridge("virtual_wall", device, coupling, **options) as bridge:  # type: ignore[arg-type]
+def run(
+    device: OwnDevice, coupling: Coupling | None, file: Path | None = None, **more: Any
+) -> Summary:
+    options = {"clock": SimulatedClock(), "recording": file, "scene": "virtual_wall"} | more
+    with Bridge(options.pop("scene"), device, coupling, **options) as bridge:
         return bridge.run(2.0)
 
 
@@ -219,7 +257,7 @@ HANDS = [(200.0, 0.05), (3000.0, 0.2), (15_421.0, 0.2), (60_000.0, 0.2), (200_00
 def test_a_slow_device_that_is_certified_gives_no_energy(
     every: int, hand: tuple[float, float]
 ) -> None:
-    device = SlowDevice(every, *hand, rate=1000.0 / every)
+    device = OwnDevice(hand, every=every, rate=1000.0 / every)
     summary = run(device, None)
     assert summary.is_certified is True
     assert device.gained < 1e-6
@@ -227,7 +265,7 @@ def test_a_slow_device_that_is_certified_gives_no_energy(
 
 def test_the_condition_of_a_shorter_tick_fails_on_it(tmp_path: Path) -> None:
     # b >= K/(2 rate) + B' took this coupling for one that needs 1.7 of 2 N s/m
-    device = SlowDevice(8, *HANDS[2], rate=125.0)
+    device = OwnDevice(HANDS[2], every=8, rate=125.0)
     usual = default_method().requested_coupling(Coupling(300.0, 0.5, 0.3, 5e-4), T)
     summary = run(device, usual, tmp_path / "slow.mcap")
     assert device.gained > 0.1
@@ -238,8 +276,59 @@ def test_the_condition_of_a_shorter_tick_fails_on_it(tmp_path: Path) -> None:
     assert "device damping 2 < 7.13846 N s/m with one sample in 8 ticks" in summary.conditions[0]
 
 
+@pytest.mark.parametrize("late", [0.25, 1.0, 1.5, 3.0, 8.0])
+def test_a_late_device_that_is_certified_gives_no_energy(late: float) -> None:
+    rng, certified = np.random.default_rng(int(100 * late)), 0
+    for scene in ("virtual_wall", "point_mass") * 3:
+        device = OwnDevice(
+            (10 ** rng.uniform(0, 4), 10 ** rng.uniform(-1, 0.5)),
+            late=lambda _: late,
+            mass=10 ** rng.uniform(-1.3, 0),
+            start=(rng.uniform(0, 5e-3), rng.uniform(0, 0.5)),
+            delay=late * T,
+        )
+        ratio = T * 10 ** rng.uniform(-1, 1)
+        most = 0.999 * 2.0 / float(late_minimum_damping(1.0, ratio, T, late * T))
+        law = Coupling(most, ratio * most, 1e-3 * most, 1e-3 * ratio * most)
+        summary = run(device, default_method().requested_coupling(law, T), scene=scene)
+        certified += summary.is_certified is True
+        assert device.gained < 1e-6
+    assert certified >= 4
+
+
+def test_a_walls_rule_fails_behind_a_delay_and_is_not_certified(tmp_path: Path) -> None:
+    # b >= K (T/2 + t_d) holds for a wall alone; this tool yields
+    law = Coupling(2.0 / (T / 2 + 3 * T), 0.0, 0.5, 0.0)
+    gained = []
+    for stiffness in (30.0, 300.0, 3000.0):
+        device = OwnDevice((stiffness, 0.05), late=lambda _: 3.0, delay=3 * T)
+        requested = default_method().requested_coupling(law, T)
+        summary = run(device, requested, tmp_path / "wall.mcap")
+        assert summary.is_certified is audit(tmp_path / "wall.mcap").certified is False
+        gained.append(device.gained)
+    assert max(gained) > 0.01
+
+
+def test_forces_later_than_stated_are_counted_where_the_loop_was_late(tmp_path: Path) -> None:
+    # the loop sends its forces most of a tick late while the hand presses the wall
+    path, found = tmp_path / "late.mcap", []
+    for share in (0.0, 0.9):
+        clock = SlowClock({})
+        spend = lambda sent, s=share: clock.spend(s * (365 < sent < 430))  # noqa: B023, E731
+        device = ScriptedDevice(stroke, on_write=spend, delay=1e-3)
+        law = Coupling(*stiffest_late_coupling(2.0, T, T, 1), 2e-4, 2e-4)
+        requested = default_method().requested_coupling(law, T)
+        summary = recorded(path, "virtual_wall", device, requested, clock=clock, duration=1.0)
+        report = audit(path)
+        assert report.timekeeping is not None
+        told = summary.timekeeping.delay_energy
+        assert report.timekeeping.delay_energy == pytest.approx(told, rel=1e-6, abs=1e-12)
+        found.append(told)
+    assert found[1] > found[0]
+
+
 def test_the_rate_of_a_slow_device_is_proposed() -> None:
-    info = SlowDevice(8, 1.0, 0.0, rate=125.0).info
+    info = OwnDevice((1.0, 0.0), rate=125.0).info
     usual = default_coupling(info, 1 / 125)
     law = default_method().law_coupling(usual, T)
     (condition,) = conditions_of(LoopSetting(info=info, law=law, period=T, method=default_method()))

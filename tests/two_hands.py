@@ -12,7 +12,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import Method, method_named, prepare
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.force_level import keep_state, limited_wrench_after_step
-from hapticbridge.kernel.jit import compiled
+from hapticbridge.kernel.jit import compiled, direct
 from hapticbridge.kernel.ledger import meter_ports
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
 from hapticbridge.kernel.pose import dot
@@ -178,6 +178,52 @@ def one_after_the_other(
 
 
 @compiled
+def _move_devices(
+    states: NDArray[np.void],
+    samples: NDArray[np.void],
+    moves: NDArray[np.float64],
+    habits: NDArray[np.float64],
+    tick: int,
+    account: NDArray[np.float64],
+) -> None:
+    b, b_r, pace = habits[0], habits[1], habits[2]
+    period = states[0].run.period
+    for hand in range(2):
+        s, length = states[hand], int(habits[3 + hand])
+        w = s.loop.wrench_on_device
+        d, t = moves[hand, :3] * period, moves[hand, 3:] * period
+        if (tick // length) % 2 == 1:
+            d, t = w[:3] * (pace / b * period), w[3:] * (pace / b_r * period)
+        d *= min(1.0, 3.0 * period / (np.sqrt(np.sum(d * d)) + 1e-30))
+        t *= min(1.0, 20.0 * period / (np.sqrt(np.sum(t * t)) + 1e-30))
+        given = np.sum((w[:3] - b / period * d) * d) + np.sum((w[3:] - b_r / period * t) * t)
+        account[0] += given
+        for i in range(3):
+            samples[hand].position[i] += d[i]
+        q = samples[hand].quaternion
+        angle = np.sqrt(np.sum(t * t))
+        if angle > 0.0:
+            c, n = np.cos(0.5 * angle), np.sin(0.5 * angle) / angle
+            x, y, z = n * t[0], n * t[1], n * t[2]
+            e, f, g, h = q[0], q[1], q[2], q[3]
+            q[0] = c * e - x * f - y * g - z * h
+            q[1] = c * f + x * e + y * h - z * g
+            q[2] = c * g - x * h + y * e + z * f
+            q[3] = c * h + x * g - y * f + z * e
+
+
+@compiled
+def _close_account(states: NDArray[np.void], account: NDArray[np.float64]) -> None:
+    energy = states[0].energy
+    released = min(energy.kinetic + energy.potential - energy.start_energy, 0.0)
+    owed = 0.0
+    for hand in range(2):
+        owed += states[hand].coupling.owed[0] + states[hand].coupling.owed[1]
+    account[1] = max(account[1], account[0] + released - owed)
+    created = max(energy.environment_energy, states[1].energy.environment_energy)
+    account[2] = max(account[2], created)
+
+
 def attack(
     states: NDArray[np.void],
     samples: NDArray[np.void],
@@ -198,45 +244,18 @@ def attack(
     Returns:
         Largest energy in J, largest Σ E_k of both accounts in J, and count of completed ticks.
     """
-    b, b_r, pace = habits[0], habits[1], habits[2]
-    period = states[0].run.period
-    net, most, created = 0.0, 0.0, 0.0
-    for k in range(moves.shape[0]):
-        for hand in range(2):
-            s, length = states[hand], int(habits[3 + hand])
-            w = s.loop.wrench_on_device
-            d, t = moves[k, hand, :3] * period, moves[k, hand, 3:] * period
-            if (k // length) % 2 == 1:
-                d, t = w[:3] * (pace / b * period), w[3:] * (pace / b_r * period)
-            d *= min(1.0, 3.0 * period / (np.sqrt(np.sum(d * d)) + 1e-30))
-            t *= min(1.0, 20.0 * period / (np.sqrt(np.sum(t * t)) + 1e-30))
-            net += np.sum((w[:3] - b / period * d) * d) + np.sum((w[3:] - b_r / period * t) * t)
-            for i in range(3):
-                samples[hand].position[i] += d[i]
-            q = samples[hand].quaternion
-            angle = np.sqrt(np.sum(t * t))
-            if angle > 0.0:
-                c, n = np.cos(0.5 * angle), np.sin(0.5 * angle) / angle
-                x, y, z = n * t[0], n * t[1], n * t[2]
-                e, f, g, h = q[0], q[1], q[2], q[3]
-                q[0] = c * e - x * f - y * g - z * h
-                q[1] = c * f + x * e + y * h - z * g
-                q[2] = c * g - x * h + y * e + z * f
-                q[3] = c * h + x * g - y * f + z * e
-        if habits[5] == 0.0:
-            is_done = whole_tick(states, samples, rows, period)
-        else:
-            is_done = one_after_the_other(states, samples, rows, period)
-        if not is_done:
-            return most, created, k
-        energy = states[0].energy
-        released = min(energy.kinetic + energy.potential - energy.start_energy, 0.0)
-        owed = 0.0
-        for hand in range(2):
-            owed += states[hand].coupling.owed[0] + states[hand].coupling.owed[1]
-        most = max(most, net + released - owed)
-        created = max(created, energy.environment_energy, states[1].energy.environment_energy)
-    return most, created, moves.shape[0]
+    account, period = np.zeros(3), float(states[0]["run"]["period"])
+    move = direct(_move_devices, states, samples, moves[0], habits, 0, account)
+    close = direct(_close_account, states, account)
+    run_tick = one_after_the_other if habits[5] else whole_tick
+    done = len(moves)
+    for tick, velocities in enumerate(moves):
+        move(states, samples, velocities, habits, tick, account)
+        if not run_tick(states, samples, rows, period):
+            done = tick
+            break
+        close(states, account)
+    return float(account[1]), float(account[2]), done
 
 
 @dataclass(frozen=True, slots=True)

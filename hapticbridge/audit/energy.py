@@ -167,6 +167,7 @@ class EnergyBalance:
             hand. It is what the guard's energy limit bounds, with the damping that the guard takes.
         unpaid_energy: Energy given to the hand beyond what may have paid for it before the tick,
             (n,) in J (``hand_energy.HandEnergy``); zero without a hand.
+        stored: q (W_c + V − V_0) of ``kernel.timing`` after each tick, (n,) in J.
         springs: Energy at the hand that the coupling's springs held at the start and after each
             reset, in J.
         released: Energy in J that the scene's storage has given to the hand after the last tick.
@@ -184,6 +185,7 @@ class EnergyBalance:
     excess_device_energy: Array
     net_energy: Array
     unpaid_energy: Array
+    stored: Array
     springs: float
     released: float
     contact_tank: Array
@@ -239,6 +241,8 @@ class EnergyBalance:
         totals |= _released(totals, before, stored - others_work, is_reset)
         ratio = parameters.force_scale / parameters.scale
         net, unpaid = _hand_energies(ratio, totals, before, is_reset)
+        stretched = motion.stretch, motion.twist
+        held = stored_in_springs(parameters, gains, stretched) - totals["start_springs"]
         # D_k = min(cap, D_{k-1} - E_k) is the lowest cap + Σ E so far, or 0, minus Σ E
         ceiling = np.minimum(
             np.minimum.accumulate(parameters.tank_cap + created), before["tank_ceiling"]
@@ -254,6 +258,7 @@ class EnergyBalance:
             excess_device_energy=excess,
             net_energy=net * parameters.guarding.has_hand,
             unpaid_energy=unpaid * parameters.guarding.has_hand,
+            stored=ratio * (coupling_work + held),
             springs=float(ratio * totals["start_springs"][-1]),
             released=float(totals["released"][-1]),
             contact_tank=(ceiling - created) * (parameters.is_rigid and not parameters.scene_ticks),

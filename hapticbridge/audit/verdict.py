@@ -689,7 +689,7 @@ def _check_records(
             tank = parts[0][1].contact_tank
             balance = replace(own, slack=slack, throughput=throughput, contact_tank=tank)
             energies[hand].add(block.ticks, balance)
-            timings[hand].add(block, run.events)
+            timings[hand].add(block, balance)
             duration = 1e-9 * float(block.ticks["deadline_ns"][-1])
             faults.append(_block_fault(block, balance, run.events))
         found = [each for each in faults if each is not None]

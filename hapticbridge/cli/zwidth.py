@@ -13,7 +13,7 @@ from hapticbridge.arguments import Arguments, option, shared
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress, write_figure
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
-from hapticbridge.demand.certificate import IF_TIMELY, DampingCondition, conditions_of
+from hapticbridge.demand.certificate import DampingCondition, conditions_of
 from hapticbridge.demand.loop_setting import (
     IN_TIME,
     Lag,
@@ -344,8 +344,8 @@ class Bound:
                 }
             )
         else:
-            is_stated = condition is not None and condition.is_delay_stated
-            self._print(ways, shown, period, b, limit=f", {IF_TIMELY}" * is_stated, holds=holds)
+            limit = "" if condition is None else condition.clause
+            self._print(ways, shown, period, b, limit=limit, holds=holds)
             if condition is not None and (b is None or condition.steps is not None):
                 out.print(plain(condition.sentence()))
         if self.plot is not None:

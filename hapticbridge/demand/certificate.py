@@ -14,7 +14,6 @@ from hapticbridge.demand.loop_setting import (
     Axis,
     Lag,
     LoopSetting,
-    delay_ticks,
     device_period,
     required_damping,
 )
@@ -210,8 +209,7 @@ class DampingCondition:
         available: The device's damping b; None if unknown.
         remedy: Changes with which it holds with 15 % in reserve (``NEEDED_SHARE``); empty if it
             holds.
-        delay: Ticks from a sample to the wrench that answers it, 0 at best; None if unknown.
-        tick: Length of such a tick in s.
+        delay: Time in s from a sample to the wrench that answers it, 0 at best; None if unknown.
         ticks_per_sample: Ticks for which one force is held, 1 at best.
         steps: Condition on the encoder's steps along this kind of axis; None without one.
         is_delay_stated: True if no measurement confirms the delay.
@@ -224,8 +222,7 @@ class DampingCondition:
     needed: float
     available: float | None
     remedy: str = ""
-    delay: int | None = 0
-    tick: float = 0.0
+    delay: float | None = 0.0
     ticks_per_sample: int = 1
     steps: StepCondition | None = None
     is_delay_stated: bool = False
@@ -252,6 +249,15 @@ class DampingCondition:
     def unit(self) -> str:
         """Unit of the damping."""
         return "N m s/rad" if self.axis == "rotation" else "N s/m"
+
+    @property
+    def clause(self) -> str:
+        """Limit of a certificate for a delay that no measurement confirms; or empty."""
+        if not self.is_delay_stated or self.delay is None:
+            return ""
+        if not self.delay:
+            return f", {IF_TIMELY}"
+        return f", if its forces come {format_si(self.delay, 's')} after their samples"
 
     def lack(self, bound: str) -> str:
         """Returns a clause on what is missing; ``bound`` names the damping that is needed."""
@@ -282,11 +288,8 @@ class DampingCondition:
         if self.delay is None:
             text = f"{text}, if it answers without delay, which is unknown"
         elif self.delay:
-            late = format_si(self.delay * self.tick, "s")
-            ticks = "1 tick" if self.delay == 1 else f"{self.delay} ticks"
-            text = f"{text} with its delay of {late} ({ticks}), for which no proof is built in yet"
-        elif self.is_delay_stated:
-            text = f"{text}, {IF_TIMELY}"
+            text = f"{text} with its delay of {format_si(self.delay, 's')}"
+        text += self.clause
         return text if self.steps is None else f"{text}; {self.steps.sentence()}"
 
 
@@ -319,8 +322,7 @@ def _condition(loop: LoopSetting, axis: Axis, available: float | None) -> Dampin
         needed,
         available,
         remedy,
-        delay_ticks(loop.info, loop.period),
-        loop.period,
+        loop.info.delay,
         loop.lag.ticks_per_sample,
         _steps(loop) if axis == "translation" else None,
         not loop.info.is_delay_measured,
@@ -544,10 +546,9 @@ def is_run_certified(conditions: tuple[DampingCondition, ...], method: Method) -
 
 
 def is_certified(conditions: tuple[DampingCondition, ...]) -> bool | None:
-    """Returns True if all conditions hold; None if one is unknown or a delay forbids a proof."""
+    """Returns True if all conditions hold; None if the outcome of one, or a delay, is unknown."""
     verdict = worst_verdict([condition.holds for condition in conditions])
-    is_late = any(condition.delay != 0 for condition in conditions)
-    return None if verdict and is_late else verdict
+    return None if verdict and any(each.delay is None for each in conditions) else verdict
 
 
 def worst_verdict(verdicts: Sequence[bool | None]) -> bool | None:

@@ -7,12 +7,7 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any
 
-from hapticbridge.demand.certificate import (
-    IF_TIMELY,
-    DampingCondition,
-    is_run_certified,
-    run_conditions,
-)
+from hapticbridge.demand.certificate import DampingCondition, is_run_certified, run_conditions
 from hapticbridge.demand.methods import Method
 from hapticbridge.demand.timekeeping import NOT_KEPT, RunTimes, Timekeeping
 from hapticbridge.device import DeviceInfo
@@ -33,7 +28,6 @@ class Standing(StrEnum):
         TRIPPED: The guard stopped the run.
         DAMPING_UNKNOWN: Its damping is unknown.
         DELAY_UNKNOWN: Its delay is unknown.
-        LATE: It has the damping for its delay, but no proof is built in.
         UNPROVED: Nothing proves that it bears the coupling: no law, or axes without a motor.
         NO_HAND: Its motion is prescribed, so there is nothing to certify.
     """
@@ -47,7 +41,6 @@ class Standing(StrEnum):
     TRIPPED = "tripped"
     DAMPING_UNKNOWN = "damping unknown"
     DELAY_UNKNOWN = "delay unknown"
-    LATE = "late"
     UNPROVED = "unproved"
     NO_HAND = "no hand"
 
@@ -73,7 +66,6 @@ _NO_HAND = "feels no force, as its motion is prescribed: there is nothing to cer
 _OPEN = {
     Standing.DAMPING_UNKNOWN: UNKNOWN_DAMPING,
     Standing.DELAY_UNKNOWN: "its delay is unknown ('hapticbridge identify' measures it)",
-    Standing.LATE: "it answers late, and no proof is built in yet",
     Standing.UNPROVED: "nothing proves that it bears the coupling",
 }
 
@@ -174,8 +166,7 @@ class Certification:
     @property
     def _if(self) -> str:
         """Clause on a delay that no measurement confirms."""
-        is_stated = any(each.is_delay_stated for each in self.conditions)
-        return f", {IF_TIMELY}" if is_stated else ""
+        return next(filter(None, (each.clause for each in self.conditions)), "")
 
     @property
     def fact(self) -> str:
@@ -263,4 +254,4 @@ def _open(conditions: Sequence[DampingCondition], method: Method) -> Standing:
         return Standing.DAMPING_UNKNOWN
     if any(each.delay is None for each in felt):
         return Standing.DELAY_UNKNOWN
-    return Standing.LATE if any(each.delay for each in felt) else Standing.UNPROVED
+    return Standing.UNPROVED

@@ -67,8 +67,7 @@ class Lag:
 
     Attributes:
         ticks_per_sample: n, ticks of the loop for which one force is held; at least 1.
-        delay: t_d in s from a sample to its force, >= 0, in whole ticks of the loop, rounded up. An
-            unknown delay counts as 0.
+        delay: t_d in s from a sample to its force, >= 0. An unknown delay counts as 0.
     """
 
     ticks_per_sample: int = 1
@@ -77,8 +76,7 @@ class Lag:
     @classmethod
     def of(cls, info: DeviceInfo, period: float) -> Lag:
         """Returns that of a device on a loop of period T in s."""
-        delay = (delay_ticks(info, period) or 0) * period
-        return cls(whole_ticks(device_period(info, period), period), delay)
+        return cls(whole_ticks(device_period(info, period), period), info.delay or 0.0)
 
 
 IN_TIME = Lag()
@@ -151,22 +149,18 @@ def required_damping(
     if k == 0.0:
         return float(b * held / law_evaluations)
     delay = delayed_by(whole_ticks(lag.delay, held))
-    identity, means = np.eye(count), np.zeros(count)
-    means[:law_evaluations] = 1.0 / law_evaluations
+    slack = 0.5 * SLACK_SHARE * (k + b)
     most = 0.0
     for theta in _frequencies(delay):
-        z = np.exp(1j * theta)
-        difference = identity - np.eye(count, k=-1) + 0j
-        difference[0, -1] -= 1 / z  # last deflection before the sample
-        law = k * identity + b * difference
-        form = law.conj().T @ difference
-        slack = 0.5 * SLACK_SHARE * (k + b)
-        form = 0.5 * (form + form.conj().T) - slack * difference.conj().T @ difference
-        linear = 0.5 * law.conj().T @ ((z ** (delay + 1) - 1) * means)
-        linear += slack * difference.conj().T @ means
-        gained = np.vdot(linear, np.linalg.solve(form, linear)).real + slack / law_evaluations
-        most = max(most, float(gained))
-    return most * held
+        # the form is diagonal in deflections that turn by one of these angles per evaluation
+        angles = (theta + 2.0 * np.pi * np.arange(count)) / count
+        backward = -np.expm1(1j * angles)  # conjugate of δe_i / e_i
+        form = (0.5 * k + b - slack) * np.abs(backward) ** 2
+        ahead = np.expm1(1j * theta * (delay + 1))
+        mean = np.sin(0.5 * law_evaluations * angles) / np.sin(0.5 * angles) / law_evaluations
+        linear = (0.5 * ahead * (k + b * backward) + slack * backward) * mean
+        most = max(most, float(np.mean(np.abs(linear) ** 2 / form)))
+    return (most + slack / law_evaluations) * held
 
 
 def _frequencies(delay: int) -> NDArray[np.float64]:

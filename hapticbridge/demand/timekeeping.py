@@ -4,23 +4,23 @@ The device condition b >= N, N = K T/2 + B', is computed for ticks each T and a 
 once. A run certifies its device only if it kept its time, which means two things.
 
 1. The condition still holds with three measured averages: the time between new samples T/s, the
-   sample jitter j, and the delay t_d from sample to force.
+   sample jitter j, and the time t_w from sample to write, added to the delay t_d of the device.
 
-       b >= N (1/s + j/T) + 3 κ t_d/T,    κ = (K T/2)²/N
+       b >= N (1/s + j/T) + N(t_d + t_w) − N(t_d)
 
-   s is the smaller of two shares: deadlines that were kept, and samples that were new. In ticks
-   without a new sample the tool moves, so that these ask for m (m − 1) (K T)²/(4 N) more, with one
-   new sample in m ticks on average. j is the
-   mean time by which a sample came later after its deadline than the one before; 0 if earlier.
+   N(t) is what a delay t needs (``theory.bounds.late_minimum_damping``), N = N(t_d). s is the
+   smaller of two shares: deadlines that were kept, and samples that were new. In ticks without a
+   new sample the tool moves, so that these ask for m (m − 1) (K T)²/(4 N) more, with one new sample
+   in m ticks on average. j is the mean time by which a sample came later after its deadline than
+   the one before; 0 if earlier.
 
-2. Single delays gave the hand at most ``INSTANT`` in energy beyond what b burned
-   (``kernel.timing``, and again ``audit.timing``).
+2. Samples and forces gave the hand at most ``INSTANT`` in energy beyond the account of the
+   condition, at the times that they had (``kernel.timing``, and again ``audit.timing``).
 
-It is safe, because the handle slips after a late sample until the springs hold less by what the
-sample may have put in (``kernel.law.charge_lateness``). The first part is therefore more than
-safety needs; it keeps a run at a fifth of its rate from being called certified for the whole rate.
-The second bounds what delays gave, for any hand: also by a force that was held for so long that the
-springs cannot pay for it.
+The second bounds what the times gave in this run, for any hand. A late sample pays for itself,
+because the handle slips until the springs hold less by what it may have put in
+(``kernel.law.charge_lateness``). The first part is therefore more than this run needs; it keeps a
+run at a fifth of its rate from being called certified for the whole rate.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from hapticbridge.kernel.hand_energy import INSTANT
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import TickFlag
 from hapticbridge.kernel.swing_watch import PUSH, STAND
-from hapticbridge.kernel.timing import DELAY_PRICE
+from hapticbridge.theory.bounds import late_minimum_damping
 from hapticbridge.units import format_si
 
 NOT_KEPT = "the run did not keep its time"
@@ -59,7 +59,7 @@ class RunTimes:
         mean_delay: Mean time in s from a sample to its force.
         mean_jitter: Mean time in s by which samples came later than the ones before, 0 for early
             ones; each after its own deadline.
-        delay_energy: Largest energy in J that delays may have given to the hand.
+        delay_energy: Largest energy in J that the times may have given to the hand.
         is_realtime: True if real time was requested from the system.
         fresh: Share of the samples due that were new, 0 to 1.
         new_samples: Number of ticks with a new sample.
@@ -390,7 +390,9 @@ def _at_times(
         # samples that did not come: the tool moved in the ticks between them
         count = max(times.ticks / times.new_samples, ticks) if times.new_samples else math.inf
         needed += ratio * kappa * period * count * (count - ticks)
-        needed += ratio * DELAY_PRICE * ticks * kappa * times.mean_delay
+        delays = condition.delay or 0.0, (condition.delay or 0.0) + times.mean_delay
+        stated, whole = (late_minimum_damping(k, b, period, delay, ticks) for delay in delays)
+        needed += ratio * float(whole - stated)
     at_times = replace(condition, needed=needed)
     if at_times.holds is False and condition.holds is not False:
         return replace(at_times, remedy=remedy)

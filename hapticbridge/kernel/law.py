@@ -474,17 +474,14 @@ def _held(s: State, v: Vector, first: int, length: float) -> Vector:
 
 
 @compiled
-def lateness(s: State, kind: int, interval: float, ticks: int) -> tuple[float, float, float, float]:
-    """Returns the terms of a sample's lateness for translation (0) or rotation (1).
+def _lateness(s: State, kind: int, interval: float, ticks: int) -> float:
+    """Returns the energy D of ``charge_lateness`` in J, of translation (0) or rotation (1).
 
     Args:
         s: The bound state, with the handle's new step d.
         kind: 0 or 1.
         interval: Time t since the last new sample in s.
         ticks: m, ticks in this time.
-
-    Returns:
-        K, K/2 + B'/T, the energy D of ``charge_lateness`` and ‖d‖².
     """
     k, run, pose = s.coupling, s.run, s.pose
     stiffness, damping, across = k.stiffness, k.damping, 0.0
@@ -508,7 +505,7 @@ def lateness(s: State, kind: int, interval: float, ticks: int) -> tuple[float, f
             pulled_on = rotation_between(quaternion_of(pose.tool_quaternion), turn)
         paid = needed * dot(pulled_on, pulled_on) / (ticks - 1)
         late += max(stiffness * dot(pulled_on, d) - paid, 0.0)
-    return stiffness, needed, late, dot(d, d)
+    return float(late)
 
 
 @compiled
@@ -539,7 +536,7 @@ def charge_lateness(s: State, interval: float, ticks: int) -> None:
     if ticks == 1:
         note_tool(s)
     for kind in range(2):
-        _, _, late, _ = lateness(s, kind, interval, ticks)
+        late = _lateness(s, kind, interval, ticks)
         s.coupling.owed[kind] = max(s.coupling.owed[kind] + late, 0.0)
 
 

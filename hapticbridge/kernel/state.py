@@ -20,7 +20,7 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | springs     | springs and dampers of the tool's tree            | springs                       |
 | contact     | tank and share of rigid contacts                  | rigid_contact                 |
 | shown       | shown pose of a slower scene's tool, its tank     | shown_tool                    |
-| timing      | delay of the force, energy that it may have given | timing                        |
+| timing      | times of samples and forces, their energy         | timing                        |
 """
 
 from __future__ import annotations
@@ -402,6 +402,7 @@ class BoundKernel:
         bind_guard(s["guard"], parameters)
         bind_observer(s["observer"], parameters.guarding)
         bind_watch(s["watch"], parameters)
+        s["timing"]["device_delay_ns"] = round(1e9 * parameters.guarding.stated_delay)
         bind_shown(s["shown"], parameters)
         is_rigid = parameters.is_rigid and not parameters.scene_ticks and self._meters_scene
         own = replace(parameters, is_rigid=is_rigid)

@@ -141,7 +141,7 @@ from hapticbridge.kernel.tick_guard import (
     refusal,
     send_within,
 )
-from hapticbridge.kernel.timing import meter_debt, meter_delay, note_delay, skip_delay
+from hapticbridge.kernel.timing import note_delay, note_motion
 
 LOOP_DTYPE = np.dtype(
     [
@@ -235,18 +235,15 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
     is_timed = s.run.has_law and s.guard.has_hand and s.loop.tick > s.guard.start_tick
     if is_timed:
         charge_lateness(s, interval, ticks)
-        meter_delay(s, interval, ticks)
     else:
         note_tool(s)
-        skip_delay(s)
     if s.mj.metered_mocaps > 0 and s.run.scheme != Scheme.SHOWN:
         note_moved_mocap_bodies(s)
     if s.coupling.tuning_ticks > 0:
         max_stretch, max_twist = retune(s)
         s.loop.has_positions = 0  # it was computed with the old gains
     has_slipped = slip(s, max_stretch, max_twist)
-    if is_timed:
-        meter_debt(s)
+    note_motion(s, moved, turned, lever, is_timed)
     if has_slipped and s.run.scheme == Scheme.MIDPOINT:
         note_slip(s)
     if has_slipped or (lever < 1.0 and (moved != _AT_REST or turned != _AT_REST)):

@@ -1,114 +1,189 @@
-"""Energy that a force sent late may have given to the hand, tick by tick.
+"""Energy that the times of samples and forces may have given to the hand, sample by sample.
 
-The condition b >= N, N = K T/2 + B', assumes one tick every T, and a force that acts from the
-moment of its sample. A tick comes τ after the one before, and its force is sent t_d after its
-sample: until then the old force acts on. With f on the tool, d the device's motion between two
-samples and η its part before the new force was sent, the hand gets
+The condition b >= N assumes that samples come each T and that each force acts a constant time after
+its sample: the stated delay of the device t_d, 0 for one that answers within the tick. In a run,
+samples come late or not at all, and a force is sent some time after its sample. So each run keeps
+the account by which the condition is proved, at the times that it had:
 
-    (f_{k−1} − f_{k−2})·η_k
+    A_k = max(A_{k−1} + E_k + u'_k·δp_k + q Δ(W_c + V − V_0), −C),    q = force_scale / scale
 
-beyond the account of a hold. The tool gets f at once, so the delay is on the device's side alone.
-For any motion within the tick, any hand and any strict environment, the damping needed then is
+with the coupling's work on the scene W_c, the energy of its springs V, that at the start and after
+resets V_0, all in J after the tick, and the wrench u that axes without a motor would be sent. E_k
+is the most that the device gave to the hand since the last new sample. The hand moved by δp_k and
+felt the wrenches w(t), each from t_d after it was sent until the next one came. For any motion,
 
-    b_k = N τ_k/T + 3 κ t_d/T,    κ = (K T/2)²/N
+    E_k = w'_k·δp_k + ∫ ‖w(t) − w'_k‖² dt/(4 b),    w' = w r_{k−1}/r_k
 
-With B' = 0 this is K (τ/2 + 3 t_d/2): K t_d as for a wall, and half as much again for a tool that
-moves and a hand that moves just while the old force acts. It is exact there. With B' > 0 it is an
-upper bound, found by comparison with the largest value of a quadratic form at all frequencies
-(``tests/test_timekeeping.py``). With β = t_d/T the form is, for δe = d − δx,
+and for the motion δp_k within the time τ, however it was spread, with the mean w̄ of w,
 
-    −Re f_{−1}*d + Re (f_{−1} − f_{−2})*η + Re f*δx − (b/T) (|d|² + |η − β d|²/(β (1 − β)))
+    E_k = w̄·δp_k − b ‖δp_k‖²/τ + ∫ ‖w(t) − w̄‖² dt/(4 b)
 
-Its last term is what b burns at least, if η is not the even share β d. It must never be positive.
+which is never more. r is the lever: the handle moved by r_{k−1} times the device's motion. The
+first is taken, so that A holds what another hand could have had at the same forces. After a late
+sample it is the second: then the handle slips for the motion that there was
+(``law.charge_lateness``). In ticks without a new sample the device may have held the force of the
+last one, so that no other enters w.
 
-The first term of b_k beyond N is paid by ``law.charge_lateness``: after a late sample the handle
-slips. A debt that the springs cannot cover is carried on. The hand is assumed to have it, but no
-more than the net energy that it received: the work of the wrenches less what b burned. The second
-term is not paid, so it is summed here, for translation and rotation each, as
+C is 0 for a device in time. Behind a delay it is the energy credit of the passivity controller:
+what wrenches on their way will cost, motion has paid for before.
 
-    A_k = max(0, A_{k−1} + 3 κ (t_d/T) D_k²/τ_k − (b − N τ_k/T) d_k²/τ_k)
+No property of the law is assumed: force level, slip, lever, changed gains, contacts, several hands
+and slower scenes are all in W_c and V. From any sample on, the hand gets at most A + C + q V, and
+what the scene had or created. In a strict scene with b >= N and constant times, A stays near 0;
+see ``theory.bounds.late_minimum_damping``. What a scene within its slack created
+is added to A for a device that answers late: only the condition of a device in time pays for it.
 
-d is the handle's motion with the device, D the larger one of this sample and the last.
-
-A sample may come in one of m ticks only. The forces of two samples then differ by the deflections
-of m ticks, and the form holds with them all. It asks for m κ in place of κ, and for b >= m N_m,
-N_m = N + (m − 1) (K T)²/(4 N), as ``theory.bounds.late_minimum_damping`` has it; τ is the time
-between two samples. Both are exact for B' = 0. N has here
-what a torque across the motion costs (``law.twist_price``), but not in κ. Each joule
-that b burns is counted once: first against the cost of late samples, whose sum is ``lent``, then
-against A.
+References:
+    Brown & Colgate 1997, eq. (6); the account is its proof in the time domain.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from hapticbridge.kernel.codes import State
+from hapticbridge.kernel.codes import Part, State
 from hapticbridge.kernel.jit import compiled
-from hapticbridge.kernel.law import lateness
+from hapticbridge.kernel.law import held_energy
+from hapticbridge.kernel.pose import (
+    Vector,
+    quaternion_of,
+    rotation_between,
+    store_vector,
+    subtract,
+    vector_of,
+)
+
+LATE = 1.5
+"""Time between two samples, in T, above which the later one is late; no unit. A smaller value takes
+jitter for lateness; a larger one counts what a slip has paid."""
+
+RING = 64
+"""Number of wrenches on their way to the device that are kept; its delay is at most 50 samples."""
 
 TIMING_DTYPE = np.dtype(
     [
-        ("delay", "<f8"),  # t_d of the last tick in s
-        ("delays", "<f8"),  # sum of all t_d in s
+        ("delays", "<f8"),  # sum of the times from sample to force in s
         ("lateness", "<f8"),  # of the last sample after its deadline, in s
         ("jitter", "<f8"),  # sum of all rises of the lateness in s
-        ("lent", "<f8", 2),  # energies in J in the scene, of translation and rotation
-        ("uncovered", "<f8", 2),  # A
-        ("last_square", "<f8", 2),  # d² of the last sample in m² and rad²
-        ("max_uncovered", "<f8"),  # largest sum of A and of what is owed so far, in J at the hand
+        ("device_delay_ns", "<i8"),  # t_d in ns
+        ("is_timed", "<i8"),  # 1 if the time since the last sample is known
+        ("is_new", "<i8"),  # 1 if this tick's sample is new
+        ("lever", "<f8"),  # r_{k−1}/r_k of this tick
+        ("moved", "<f8", 6),  # δp of this tick's sample in m and rad
+        ("stored", "<f8"),  # q (W_c + V − V_0) in J after the tick of the last new sample
+        ("newest", "<i8"),  # number of wrenches that were sent
+        ("held", "<i8"),  # number of the one that the device holds
+        ("wrenches", "<f8", (RING, 6)),
+        ("arrivals", "<i8", RING),  # when they act, in ns
+        ("since", "<i8"),  # time of the last new sample in ns
+        ("now", "<i8"),  # end of the time that ``impulse`` and ``square`` cover, in ns
+        ("impulse", "<f8", 6),  # ∫ w dt
+        ("square", "<f8", 6),  # ∫ w² dt
+        ("uncovered", "<f8"),  # A in J
+        ("max_uncovered", "<f8"),  # largest A so far in J, and what the scene created
     ]
 )
 """Sub-record ``timing``, written by this module alone."""
 
-DELAY_PRICE = 3.0
-"""Damping in κ that a delay of a whole period needs."""
+
+@compiled
+def note_motion(s: State, moved: Vector, turned: Vector, lever: float, is_timed: bool) -> None:
+    """Notes the motion of a tick's sample.
+
+    Args:
+        s: The bound state.
+        moved: Translation δp in m since the last tick, in the device's frame.
+        turned: Its rotation vector in rad.
+        lever: r_{k−1}, of the wrench that was held until now.
+        is_timed: True if the time is known that the motion took, and a law answers it.
+    """
+    t = s.timing
+    t.lever = lever / s.guard.lever if s.guard.lever > 0.0 else 0.0
+    t.is_timed, t.is_new = is_timed, s.guard.consecutive_stale == 0
+    store_vector(t.moved[:3], moved)
+    store_vector(t.moved[3:], turned)
+
+
+@compiled
+def _advance(t: Part, end: int) -> None:
+    """Adds the wrenches that the device held until a time in ns."""
+    while t.now < end:
+        until, is_last = end, True
+        if t.held < t.newest and t.arrivals[(t.held + 1) % RING] < end:
+            until, is_last = max(t.arrivals[(t.held + 1) % RING], t.now), False
+        time, w = 1e-9 * (until - t.now), t.wrenches[t.held % RING]
+        for i in range(6):
+            t.impulse[i] += time * w[i]
+            t.square[i] += time * w[i] * w[i]
+        t.now = until
+        if not is_last:
+            t.held += 1
+
+
+@compiled
+def _given(s: State, time: float, is_late: bool) -> float:
+    """Returns E_k + u'_k·δp_k for a time τ in s."""
+    t, w, u, work = s.timing, s.loop.wrench_on_device, s.loop.unfelt, 0.0
+    for i in range(6):
+        b = s.observer.assumed_damping if i < 3 else s.observer.assumed_rotational_damping
+        mean, d = t.impulse[i] / time, t.moved[i]
+        middle = mean if is_late else t.lever * w[i]
+        work += (middle + t.lever * u[i]) * d
+        if is_late:
+            work -= b * d * d / time
+        spread = t.square[i] - t.impulse[i] * mean + time * (mean - middle) ** 2
+        if b > 0.0:
+            work += max(spread, 0.0) / (4.0 * b)
+    return float(work)
+
+
+@compiled
+def _stored(s: State) -> float:
+    """Returns q (W_c + V − V_0) in J."""
+    pose = s.pose
+    stretch = subtract(vector_of(pose.handle_position), vector_of(pose.tool_position))
+    twist = rotation_between(
+        quaternion_of(pose.tool_quaternion), quaternion_of(pose.handle_quaternion)
+    )
+    held = held_energy(s, stretch, twist) - s.observer.springs
+    return float(s.run.force_scale / s.run.scale * (s.energy.coupling_work + held))
 
 
 @compiled
 def note_delay(s: State, deadline_ns: int, read_ns: int, write_ns: int) -> None:
-    """Notes the times from the tick's deadline to its sample, and from its sample to its force."""
-    t, late = s.timing, 1e-9 * (read_ns - deadline_ns)
-    t.delay = 1e-9 * (write_ns - read_ns)
-    t.delays += t.delay
-    t.jitter += max(late - t.lateness, 0.0)
-    t.lateness = late
-
-
-@compiled
-def meter_delay(s: State, interval: float, ticks: int) -> None:
-    """Adds the energy that the last tick's delay may have given, in a tick with a new sample.
+    """Notes the times of a tick after its wrench was sent, and keeps the account.
 
     Args:
-        s: The bound state, with the handle's new step.
-        interval: τ, time since the last sample that was new, in s.
-        ticks: m, ticks in this time.
+        s: The bound state, with the tick's energies.
+        deadline_ns: When its sample was due.
+        read_ns: When its sample was read.
+        write_ns: When its wrench was sent.
     """
-    t = s.timing
-    if s.guard.consecutive_stale > 0:
+    t, lateness, w = s.timing, 1e-9 * (read_ns - deadline_ns), s.loop.wrench_on_device
+    t.delays += 1e-9 * (write_ns - read_ns)
+    t.jitter += max(lateness - t.lateness, 0.0)
+    t.lateness = lateness
+    if not s.run.has_law:
         return
-    for kind in range(2):
-        stiffness, needed, late, square = lateness(s, kind, interval, ticks)
-        paying = min(t.lent[kind] + late, 0.0)
-        t.lent[kind] = max(t.lent[kind] + late, 0.0)
-        cost = 0.0
-        if stiffness > 0.0:
-            half = 0.5 * stiffness
-            cost = ticks * DELAY_PRICE * half * half / needed * t.delay / interval
-        cost *= max(square, t.last_square[kind])
-        t.uncovered[kind] = max(t.uncovered[kind] + cost + paying, 0.0)
-        t.last_square[kind] = square
-
-
-@compiled
-def meter_debt(s: State) -> None:
-    """Notes the most that delays may have given, once the springs have paid for a late sample."""
-    t, owed, ratio = s.timing, s.coupling.owed, s.run.force_scale / s.run.scale
-    carried = min(ratio * (owed[0] + owed[1]), max(s.observer.net_device_energy, 0.0))
-    t.max_uncovered = max(t.max_uncovered, ratio * (t.uncovered[0] + t.uncovered[1]) + carried)
-
-
-@compiled
-def skip_delay(s: State) -> None:
-    """Begins anew with the first tick after a start: the device's motion took an unknown time."""
-    s.timing.last_square[0] = s.timing.last_square[1] = 0.0
+    credit = created = 0.0
+    if t.device_delay_ns > 0:
+        credit = s.observer.energy_credit_limit
+        created = s.run.force_scale / s.run.scale * max(s.energy.environment_energy, 0.0)
+    if not t.is_timed:  # the device held no force
+        t.held = t.newest
+        for i in range(6):
+            t.wrenches[t.held % RING][i] = 0.0
+    elif t.is_new:
+        _advance(t, read_ns)
+    if t.is_new or not t.is_timed:
+        stored, time = _stored(s), 1e-9 * (read_ns - t.since)
+        if t.is_timed and time > 0.0:
+            given = _given(s, time, time > LATE * s.run.period)
+            t.uncovered = max(t.uncovered + given + stored - t.stored, -credit)
+        t.stored, t.since, t.now = stored, read_ns, read_ns
+        t.newest += 1
+        t.arrivals[t.newest % RING] = write_ns + t.device_delay_ns
+        for i in range(6):
+            t.impulse[i] = t.square[i] = 0.0
+            t.wrenches[t.newest % RING][i] = w[i]
+    t.max_uncovered = max(t.max_uncovered, t.uncovered + created)

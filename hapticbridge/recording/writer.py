@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import os
@@ -34,7 +35,8 @@ class ChunkIndexFile:
     An MCAP file ends with the position of each chunk, for access by time. The library keeps these
     entries as objects until the file is closed: 0.9 kB per chunk, 10 MB per hour at 1 kHz. Here an
     entry takes about 100 bytes in an unnamed temporary file, beside the recording if possible. The
-    file vanishes when it is closed or its process dies.
+    file vanishes when it is closed or its process dies. Entries that a full disk refuses stay in
+    memory; the run ends soon after.
 
     Raises:
         OSError: No file can be created, there or in the temporary folder.
@@ -42,27 +44,27 @@ class ChunkIndexFile:
 
     def __init__(self, folder: Path) -> None:
         self._file = _nameless_file(folder)
+        self._size, self._rest = 0, b""
 
     def take_over(self, writer: Writer) -> None:
         """Replaces the library's private list; this is the only place that names it."""
         writer._Writer__chunk_indices = self  # type: ignore[attr-defined]
 
     def append(self, entry: ChunkIndex) -> None:
-        """Adds the entry of a finished chunk.
-
-        Raises:
-            OSError: The disk is full.
-        """
+        """Adds the entry of a finished chunk."""
         builder = RecordBuilder()
         entry.write(builder)
         data: bytes = builder.end()  # type: ignore[no-untyped-call]
-        if self._file.write(data) != len(data):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        with contextlib.suppress(OSError):
+            if not self._rest and self._file.write(data) == len(data):
+                self._size += len(data)
+                return
+        self._rest += data
 
     def __iter__(self) -> Iterator[_Entries]:
         """Yields all entries as one object, which the library writes into the summary."""
         self._file.seek(0)
-        yield _Entries(self._file.read())
+        yield _Entries(self._file.read()[: self._size] + self._rest)
 
     def close(self) -> None:
         """Deletes the file."""

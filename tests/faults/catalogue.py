@@ -373,7 +373,7 @@ def _fill_disk(rig: Rig) -> None:
 
 
 def _full_tmpfs(rig: Rig) -> None:
-    """The recording lies on a small disk of its own, which somebody fills."""
+    """The recording lies on a small disk, which fills up before the first chunk is written."""
     disk = rig.folder / "disk"
 
     def around(stack: ExitStack) -> None:
@@ -382,10 +382,15 @@ def _full_tmpfs(rig: Rig) -> None:
         stack.callback(lambda: subprocess.run(["umount", disk], check=True))
 
     def fill(bridge: Bridge, tick: int) -> None:
+        recorder = bridge.session.stream.recorder
+        assert recorder is not None
+        if tick == 0:
+            os.kill(recorder.pid, signal.SIGSTOP)
         if tick == CAUSE:
             with (disk / "rubbish").open("wb", buffering=0) as file, suppress(OSError):
                 while True:
                     file.write(bytes(4096))
+            os.kill(recorder.pid, signal.SIGCONT)
         if tick > CAUSE and tick % 50 == 0:
             keep_up(bridge)
 
