@@ -415,15 +415,14 @@ def test_a_hand_that_is_pushed_on_by_late_forces_is_found_and_rests(
     ("hand", "push", "tremor", "stiffness"),
     [
         ((0.0300, 2.0, 20.0), 4.0, 0.0, 3400.0),
-        ((0.0086, 0.98, 375.7), 0.7, 0.0, 3400.0),
         ((0.0260, 2.77, 5.0), 4.3, 0.0, 3400.0),
-        ((0.0280, 3.2, 11.5), 4.9, 1.5, None),
+        ((0.0280, 3.2, 11.5), 4.9, 3.0, None),
     ],
 )
 def test_a_stiff_wall_or_a_tremor_hides_no_late_force(
     hand: tuple[float, float, float], push: float, tremor: float, stiffness: float | None
 ) -> None:
-    """0.1 to 3.3 W went on for ever, certified. The tremor has 8 Hz; ``tremor`` is in N."""
+    """0.1 to 0.2 W went on for ever, certified. The tremor has 8 Hz; ``tremor`` is in N."""
     mass, damping, spring = hand
     held = Hand(mass=mass - 0.005, damping=damping, stiffness=spring)
     times = np.arange(0.0, 7.0, 1e-3)
