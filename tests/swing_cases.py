@@ -210,3 +210,52 @@ class OnItsStop:
 
     def close(self) -> None:
         self._force = 0.0
+
+
+class BetweenStops:
+    """Handle on a rail that a hand shakes against a stop on each side; its motor is right.
+
+    Args:
+        stop: Place in m, stiffness in N/m and damping in N s/m of each stop.
+        mass: Mass of handle and hand in kg.
+        hand: Stiffness in N/m and damping in N s/m of the hand.
+        shaking: Amplitude in m and frequency in Hz of where the hand wants to be.
+    """
+
+    info = OnItsStop.info
+
+    def __init__(
+        self,
+        stop: tuple[float, float, float],
+        mass: float,
+        hand: tuple[float, float],
+        shaking: tuple[float, float],
+    ) -> None:
+        self._stop, self._mass, self._hand, self._shaking = stop, mass, hand, shaking
+
+    def start(self, period: float) -> NDArray[np.void]:
+        self._step, self._steps = 0.1 * period, 0
+        self._place = self._speed = self._force = 0.0
+        return np.array([((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)], hb.SAMPLE_DTYPE)
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        (end, stiffness, damping), (spring, damper) = self._stop, self._hand
+        amplitude, frequency = self._shaking
+        for _ in range(10):
+            time = self._steps * self._step
+            wanted = min(time, 1.0) * amplitude * np.sin(2.0 * np.pi * frequency * time)
+            push = self._force + spring * (wanted - self._place) - (2.0 + damper) * self._speed
+            deep = self._place - min(max(self._place, -end), end)
+            back = stiffness * deep + damping * self._speed
+            push -= back if back * deep > 0.0 else 0.0
+            self._speed += self._step * push / self._mass
+            self._place += self._step * self._speed
+            self._steps += 1
+        sample[0] = ((self._place, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)
+        return 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self._force = wrench[0]
+
+    def close(self) -> None:
+        self._force = 0.0

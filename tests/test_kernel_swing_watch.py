@@ -15,7 +15,17 @@ from faults.rig import FaultyDevice
 from model_runs import LOOP_SCENES
 from numpy.typing import NDArray
 from random_hands import random_motion
-from swing_cases import ALARM, GRIPS, VERY_FIRM, OnItsStop, alarms, bunched, shakes, taps
+from swing_cases import (
+    ALARM,
+    GRIPS,
+    VERY_FIRM,
+    BetweenStops,
+    OnItsStop,
+    alarms,
+    bunched,
+    shakes,
+    taps,
+)
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
@@ -399,6 +409,58 @@ def test_a_hand_that_is_pushed_on_by_late_forces_is_found_and_rests(
             forces.append(bridge.latest_records(1000)["wrench_on_device"][:, 0].std())
         assert summary.is_certified is (ticks == 0)
     assert max(forces) <= 0.3
+
+
+@pytest.mark.parametrize(
+    ("hand", "push", "tremor", "stiffness"),
+    [
+        ((0.0300, 2.0, 20.0), 4.0, 0.0, 3400.0),
+        ((0.0260, 2.77, 5.0), 4.3, 0.0, 3400.0),
+        ((0.0280, 3.2, 11.5), 4.9, 3.0, None),
+    ],
+)
+def test_a_stiff_wall_or_a_tremor_hides_no_late_force(
+    hand: tuple[float, float, float], push: float, tremor: float, stiffness: float | None
+) -> None:
+    """0.1 to 0.2 W went on for ever, certified. The tremor has 8 Hz; ``tremor`` is in N."""
+    mass, damping, spring = hand
+    held = Hand(mass=mass - 0.005, damping=damping, stiffness=spring)
+    times = np.arange(0.0, 7.0, 1e-3)
+    swing = tremor / abs(spring + 16j * np.pi * damping) * np.sin(16 * np.pi * times)
+    along = np.minimum(times, 1.0) * (push / spring + swing)
+    path = Motion(times, [(x, 0.0, 0.0) for x in along])
+    coupling = None if stiffness is None else {"stiffness": stiffness}
+    for delay in (1 if tremor == 0.0 else 2, 0):
+        device = SimulatedDevice(mass=0.005, hand=held, path=path, delay=delay)
+        device.info = replace(device.info, delay=0.0)
+        with hb.Bridge("virtual_wall", device, coupling, clock=hb.SimulatedClock()) as bridge:
+            summary = bridge.run(5.0)
+            ticks = bridge.latest_records(1000)
+        speed = np.diff(ticks["device_position"][:, 0])[2:] / 1e-3
+        acted = ticks["wrench_on_device"][2 - delay : 999 - delay, 0]
+        assert summary.is_certified is (delay == 0)
+        assert np.mean(acted * speed - 2.0 * speed**2) <= 0.003
+
+
+@pytest.mark.parametrize(
+    ("stop", "mass", "hand", "shaking"),
+    [
+        ((0.0035, 29650.0, 2.9), 0.069, (1084.0, 5.4), (0.0165, 7.7)),
+        ((0.0023, 14900.0, 3.0), 0.069, (622.0, 2.1), (0.0090, 7.6)),
+        ((0.0047, 14100.0, 13.0), 0.061, (543.0, 2.4), (0.0150, 5.9)),
+    ],
+)
+def test_a_hand_that_shakes_a_device_against_its_stops_is_no_alarm(
+    stop: tuple[float, float, float],
+    mass: float,
+    hand: tuple[float, float],
+    shaking: tuple[float, float],
+) -> None:
+    """The damping burns at each blow, and no force has given the speed."""
+    device = BetweenStops(stop, mass, hand, shaking)
+    with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock()) as bridge:
+        summary = bridge.run(4.0)
+    assert summary.is_certified
 
 
 def test_a_light_hand_is_no_alarm_if_the_force_comes_in_time(tmp_path: Path) -> None:

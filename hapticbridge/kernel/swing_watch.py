@@ -34,10 +34,11 @@ Findings, for translation and rotation each; E is 8 mJ at a limit of 10 N or 0.5
     ms without a stated delay, with E_s >= E for 40 ms; or c <= 0 and p < 0.6 with c_s >= 0.4 for 12
     ms. The greatest ratio r of the lever between device and handle is halved, hence the stiffness
     quartered; again for each E_s >= E.
-    slammed: Σ W² >= 0.9 of that above 4 Hz, Σ W·V <= b Σ V²/2, and b Σ V² − Σ W·V is 3 mW or more
-    at a limit of 10 N or 0.5 N m, for 0.3 s and until 8 mJ are missing; at the end, half the mean
-    or more, since a single blow is forgotten. r is halved. No hand swings so fast, so b Σ V² comes
-    from the force, and it came late. Of an unknown damping b = 0 counts.
+    slammed: b Σ V² − Σ W·V is 3 mW or more on average over 0.3 s, at a limit of 10 N or 0.5 N m,
+    and half of that average now, since a single blow is forgotten; and Σ W·V + 2 ms Σ W·A >= b Σ
+    V²/2, each for 0.3 s. r is halved. No hand swings so fast, and a force that acts later explains
+    the motion, so it did. Blows on a stop of the device lack energy, too, but come without a force:
+    Σ W·V < 0, Σ W·A is small. Of an unknown damping b = 0 counts.
     coarse: 3 steps within 0.3 s. r is halved. A step is a new sample that follows equal ones of 4
     ms and more, and over which the coupling pulls with half the limit, r K ‖δp‖ >= F/2.
 
@@ -73,7 +74,7 @@ swing has p = 0.9, c = −0.04, x > 0.6 and c_s = 0.76; faults have p < 0.6. The
 Steps of 4 mm swing between two samples 40 to 90 times a second and give at most 17 mJ. A device
 that starts from rest moves by 0.1 mm in a tick of 1 ms: 10 N on 0.05 kg.
 
-Limits of the method: a slam gives up to 0.1 J before it is found, and a smaller one some mW for as
+Limits of the method: a slam gives up to 1.4 J before it is found, and a smaller one some mW for as
 long as it lasts. A motor that holds for 60 ms gives two fingers up to 0.4 J within
 one hold, before a lower force could reach it, and 0.8 J where two throws were needed. A torque 12
 to 20 ms late gives two fingers up to 0.5 J within the throw in which it is found. A torque 2 ms
@@ -149,10 +150,10 @@ STEPS, STEP = 3.0, 0.5
 """Number of steps for a finding, and the least share of the limit that a step is worth; no unit. A
 lower share takes steps of 0.2 mm at 2400 N/m and a limit of 2 N, which can be felt, for a fault."""
 
-SLAM, PURE = 0.4, 0.9
-"""Least missing power of a slam in E per s, and least Σ W² as a share of that above
-``SLOWEST``; no unit. A swing of 25 Hz has the share 0.9, the shaking of a hand at 11 Hz up to 0.2.
-A lower ``SLAM`` finds smaller swings. Steps of an encoder of 0.2 mm seem to burn 0.1 E per s."""
+SLAM, LATER = 0.4, 0.002
+"""Least missing power of a slam in E per s, and the delay in s of the force that explains it. A
+lower ``SLAM`` finds smaller swings; steps of an encoder of 0.2 mm seem to burn 0.1 E per s. With 3
+ms, blows on a stop of the device are taken for slams; with 1 ms, one swing in ten is not found."""
 
 ANSWERS, STRIDE = 6, 2
 """Number of lags of c_s, and blocks from one to the next: 8, 16 to 48 ms. A motor that holds for 60
@@ -228,8 +229,7 @@ WATCH_DTYPE = np.dtype(
         ("mean_wrench", "<f8", 3),
         ("change", "<f8", 3),
         ("known_damping", "<f8", 2),
-        ("lacking", "<f8", 2),
-        ("swing_square", "<f8", 2),
+        ("missing_power", "<f8", 2),
         ("wrench_square", "<f8", 2),
         ("speed_square", "<f8", 2),
         ("change_square", "<f8", 2),
@@ -263,9 +263,9 @@ N m, ``late_energy`` E in J. ``cap`` is the greatest ratio after all findings, `
 allowed now, ``returns_to`` the ratio before a probe; ``probe_end`` and ``rest_end`` in blocks.
 ``wrench`` and ``motion`` are sums over the block. ``wrench_square`` to ``across`` are the sums over
 W and A, ``whole_square`` that of all acceleration; ``believed`` and ``delayed`` are E_0 and E_s;
-``swing_square`` is Σ W² above 4 Hz, ``known_damping`` b or 0, and ``lacking`` what a slam lacks in
-J; ``late_along`` are the sums over W_{k−s}·A, and ``past_means``
-and ``past_squares`` rings of W and Σ W². ``still`` counts the equal samples before this one, and
+``known_damping`` is b or 0, and ``missing_power`` the average of what a slam lacks in W;
+``late_along`` are the sums over W_{k−s}·A, and ``past_means`` and ``past_squares`` rings of W and
+Σ W². ``still`` counts the equal samples before this one, and
 ``steps`` the coarse steps of late; ``counts`` are blocks in a row of late, reversed, exchanged,
 answered late, τ_0 and slams. ``stray`` is the way from where the handle stands, ``step`` the one
 step that it may make, ``stood`` the ticks since; ``is_right`` is 1 for an axis once it moved as a
@@ -587,27 +587,19 @@ def _late_answer(watch: Part, kind: int, least: float) -> float:
 
 
 @compiled
-def _is_slammed(s: State, kind: int) -> bool:
-    """Adds a block to Σ W² above 4 Hz; returns True if the wrench swings as in a slam."""
-    watch, square = s.watch, 0.0
-    for i in range(3):
-        slow_wrench = watch.ring[6 * (watch.blocks % RING) + 3 * kind + i]
-        square += slow_wrench * slow_wrench
-    swing = watch.kept[0] * watch.swing_square[kind] + watch.block * square
-    watch.swing_square[kind] = swing
-    enough = watch.late_energy[kind] * watch.cap
+def _is_slammed(watch: Part, kind: int, taken: float) -> bool:
+    """Adds a block to the missing power; returns True if a late force has long explained it."""
     burnt = watch.known_damping[kind] * watch.speed_square[kind]
-    taken = watch.power[kind] + watch.stated_delay * max(watch.along[kind], 0.0)
     power = (burnt - taken) / FAST_MEMORY
-    is_pure = watch.wrench_square[kind] >= PURE * swing and taken <= 0.5 * burnt
-    if is_pure and power >= SLAM * enough and enough > 0.0:
-        watch.lacking[kind] += watch.block * power
+    mean = watch.kept[1] * (watch.missing_power[kind] - power) + power
+    watch.missing_power[kind] = mean
+    is_explained = taken + LATER * watch.along[kind] >= 0.5 * burnt
+    goes_on = 2.0 * power >= mean  # not one blow that is being forgotten
+    if mean >= SLAM * watch.late_energy[kind] * watch.cap and is_explained and goes_on:
         watch.counts[6 * kind + 5] += 1
     else:
-        watch.lacking[kind] = watch.counts[6 * kind + 5] = 0
-    count, lacking = watch.counts[6 * kind + 5], watch.lacking[kind]
-    goes_on = 2.0 * power * count * watch.block >= lacking  # not one blow that is being forgotten
-    return bool(count >= watch.ring_blocks and lacking >= enough and goes_on)
+        watch.counts[6 * kind + 5] = 0
+    return bool(watch.counts[6 * kind + 5] >= watch.ring_blocks and watch.cap > 0.0)
 
 
 @compiled
@@ -623,11 +615,11 @@ def _verdict(s: State, kind: int) -> int:
     wrench, change = watch.wrench_square[kind], watch.change_square[kind]
     least = KNOWN_WRENCH * (watch.limits[kind] * s.guard.lever) ** 2
     is_known = wrench > max(least, 0.0) and change > KNOWN_MOTION * watch.whole_square[kind]
+    taken = watch.power[kind] + watch.stated_delay * max(watch.along[kind], 0.0)
     power, along, across, delay = 1.0, 1.0, 1.0, 0.0
     if is_known and watch.speed_square[kind] > 0.0:
         scale = math.sqrt(wrench * change)
         along = watch.along[kind] / scale
-        taken = watch.power[kind] + watch.stated_delay * max(watch.along[kind], 0.0)
         power = taken / math.sqrt(wrench * watch.speed_square[kind])
         if along >= FOLLOWED:
             burnt = _damping(s, kind) * watch.speed_square[kind]
@@ -649,7 +641,7 @@ def _verdict(s: State, kind: int) -> int:
     is_answered = is_answered and _late_answer(watch, kind, least) >= ANSWERED
     is_answered = is_answered and watch.blocks >= watch.rings_end[kind]
     counts[at + 3] = counts[at + 3] + 1 if is_answered else 0
-    is_slammed = _is_slammed(s, kind)
+    is_slammed = _is_slammed(watch, kind, taken)
     if counts[at + 1] >= BLOCKS or counts[at + 2] >= BLOCKS:
         return RUNS_AWAY
     has_swung = watch.flags & SWINGING != 0
