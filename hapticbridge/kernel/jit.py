@@ -379,6 +379,11 @@ def compiled(function: _Function) -> _Function:
     return cast(_Function, Compiled(function, nogil=False))
 
 
+def source_of(function: _Function) -> _Function:
+    """Returns the function in Python of one from ``compiled``, for calls outside of the loop."""
+    return cast(_Function, cast(Any, function).source)
+
+
 def compiled_for_threads(function: _Function) -> _Function:
     """Compiles like ``compiled``, but releases the interpreter lock: for whole runs in threads."""
     return cast(_Function, Compiled(function, nogil=True))
