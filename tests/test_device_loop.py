@@ -131,7 +131,7 @@ def touch() -> Rig:
 
 
 RIGS: dict[str, tuple[Callable[[], Rig], str]] = {
-    "falcon": (falcon, "with its delay of 1.23 ms"),
+    "falcon": (falcon, "with its delay of 2 ms"),
     # its own period and 1 ms each way on the bus
     "rawhid": (rawhid, "its delay of"),
     "haply": (haply, "its delay of"),

@@ -108,7 +108,7 @@ class TimingTally:
                 self.since, self.stored = int(part["read_ns"][0]), float(stored[first])
             chosen = np.flatnonzero(is_new[first:end])
             sent = part[chosen]
-            delay = round(1e9 * parameters.guarding.stated_delay)
+            delay = round(1e9 * parameters.device_delay)
             self.arrivals = np.concatenate([self.arrivals, sent["write_ns"] + delay])
             self.wrenches = np.concatenate([self.wrenches, sent["wrench_on_device"]])
             times = np.concatenate([[self.since], sent["read_ns"]])
@@ -120,7 +120,7 @@ class TimingTally:
             last = max(int(np.searchsorted(self.arrivals, self.since, "right")) - 1, 0)
             self.arrivals, self.wrenches = self.arrivals[last:], self.wrenches[last:]
         steps[block.is_first] = 0.0
-        is_behind = parameters.guarding.stated_delay > 0.0
+        is_behind = parameters.device_delay > 0.0
         credit = parameters.guarding.energy_credit_limit if is_behind else 0.0
         uncovered = _drained(steps, self.uncovered + credit) - credit
         self.uncovered = float(uncovered[-1])

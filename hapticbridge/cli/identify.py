@@ -16,7 +16,7 @@ from hapticbridge.cli.terminal import notify, out, plain, print_json, progress, 
 from hapticbridge.cli.zwidth import next_command
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.demand.certificate import default_coupling
-from hapticbridge.demand.loop_setting import Lag, delay_ticks, whole_ticks
+from hapticbridge.demand.loop_setting import Lag, delay_ticks
 from hapticbridge.demand.methods import RunCoupling, default_method
 from hapticbridge.demand.plots import draw_z_width
 from hapticbridge.device import AXES, DeviceInfo, open_device
@@ -34,6 +34,7 @@ from hapticbridge.identify.identify import (
     duration_at,
     measured_profile,
 )
+from hapticbridge.kernel.parameters import whole_ticks
 from hapticbridge.plotting import check_ending
 from hapticbridge.run.options import BridgeOptions
 from hapticbridge.signals import interrupting_on_signals

@@ -19,7 +19,6 @@ from hapticbridge.demand.loop_setting import (
     Lag,
     LoopSetting,
     delay_ticks,
-    whole_ticks,
 )
 from hapticbridge.demand.methods import RunCoupling, default_method
 from hapticbridge.demand.plots import (
@@ -34,6 +33,7 @@ from hapticbridge.device import AXES, Device, DeviceInfo, open_device
 from hapticbridge.device.base import checked_close
 from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.identify.z_width import SHARES, MeasuredWidth, measure_width, measured_points
+from hapticbridge.kernel.parameters import whole_ticks
 from hapticbridge.plotting import check_ending
 from hapticbridge.run.options import DEFAULT_OPTIONS, BridgeOptions
 from hapticbridge.signals import interrupting_on_signals

@@ -209,7 +209,8 @@ class DampingCondition:
         available: The device's damping b; None if unknown.
         remedy: Changes with which it holds with 15 % in reserve (``NEEDED_SHARE``); empty if it
             holds.
-        delay: Time in s from a sample to the wrench that answers it, 0 at best; None if unknown.
+        delay: Time in s from a sample to the wrench that answers it, in whole ticks, rounded up; 0
+            at best, None if unknown.
         ticks_per_sample: Ticks for which one force is held, 1 at best.
         steps: Condition on the encoder's steps along this kind of axis; None without one.
         is_delay_stated: True if no measurement confirms the delay.
@@ -257,7 +258,7 @@ class DampingCondition:
             return ""
         if not self.delay:
             return f", {IF_TIMELY}"
-        return f", if its forces come {format_si(self.delay, 's')} after their samples"
+        return f", if its forces come equally late, by at most {format_si(self.delay, 's')}"
 
     def lack(self, bound: str) -> str:
         """Returns a clause on what is missing; ``bound`` names the damping that is needed."""
@@ -322,7 +323,7 @@ def _condition(loop: LoopSetting, axis: Axis, available: float | None) -> Dampin
         needed,
         available,
         remedy,
-        loop.info.delay,
+        None if loop.info.delay is None else loop.lag.delay,
         loop.lag.ticks_per_sample,
         _steps(loop) if axis == "translation" else None,
         not loop.info.is_delay_measured,

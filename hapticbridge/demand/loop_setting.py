@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
@@ -15,16 +14,18 @@ from hapticbridge.demand.methods import IMPLICIT, Method
 from hapticbridge.device.base import DeviceInfo
 from hapticbridge.errors import CouplingError
 from hapticbridge.kernel.ledger import SLACK_SHARE
-from hapticbridge.kernel.parameters import RunParameters, checked_substeps
+from hapticbridge.kernel.parameters import (
+    ROUNDING,
+    RunParameters,
+    checked_substeps,
+    whole_ticks,
+)
 from hapticbridge.theory.bounds import late_minimum_damping, minimum_damping
 from hapticbridge.theory.transfer import delayed_by
 
 Axis = Literal["translation", "rotation"]
 
 # Time in which a device answers
-
-_WHOLE = 1e-9
-"""Excess over a whole number of ticks that counts as rounding, in ticks."""
 
 
 def device_period(info: DeviceInfo, period: float) -> float:
@@ -35,7 +36,7 @@ def device_period(info: DeviceInfo, period: float) -> float:
     if info.rate is None or info.is_prescribed:
         return period
     own = 1.0 / info.rate
-    return own if own > period * (1.0 + _WHOLE) else period
+    return own if own > period * (1.0 + ROUNDING) else period
 
 
 def fresh_share(info: DeviceInfo, period: float, fresh: int, due: int) -> float:
@@ -56,18 +57,15 @@ def delay_ticks(info: DeviceInfo, period: float) -> int | None:
     return None if info.delay is None else whole_ticks(info.delay, period)
 
 
-def whole_ticks(delay: float, period: float) -> int:
-    """Returns the whole ticks in which a delay in s ends; ticks of ``period`` in s."""
-    return max(0, math.ceil(delay / period - _WHOLE))
-
-
 @dataclass(frozen=True, slots=True)
 class Lag:
     """Time in which a device answers, as its condition counts it.
 
     Attributes:
         ticks_per_sample: n, ticks of the loop for which one force is held; at least 1.
-        delay: t_d in s from a sample to its force, >= 0. An unknown delay counts as 0.
+        delay: t_d in s from a sample to its force, >= 0, in whole ticks of the loop, rounded up,
+            because a reply is read, and the next request sent, in a tick. An unknown delay counts
+            as 0.
     """
 
     ticks_per_sample: int = 1
@@ -76,7 +74,8 @@ class Lag:
     @classmethod
     def of(cls, info: DeviceInfo, period: float) -> Lag:
         """Returns that of a device on a loop of period T in s."""
-        return cls(whole_ticks(device_period(info, period), period), info.delay or 0.0)
+        delay = (delay_ticks(info, period) or 0) * period
+        return cls(whole_ticks(device_period(info, period), period), delay)
 
 
 IN_TIME = Lag()

@@ -146,6 +146,15 @@ SUBSTEPS = rule(least=1, most=MAX_SUBSTEPS)
 """Valid numbers of MuJoCo steps per tick, as the metadata of a field."""
 
 
+ROUNDING = 1e-9
+"""Excess over a whole number of ticks that counts as rounding, in ticks."""
+
+
+def whole_ticks(delay: float, period: float) -> int:
+    """Returns the whole ticks in which a delay in s ends; ticks of ``period`` in s."""
+    return max(0, math.ceil(delay / period - ROUNDING))
+
+
 def checked_substeps(substeps: int, error: type[HapticBridgeError] = HapticBridgeError) -> int:
     """Returns a number of MuJoCo steps per tick, 1 to ``MAX_SUBSTEPS``.
 
@@ -300,6 +309,11 @@ class RunParameters:
     def is_joint(self) -> bool:
         """True if the hand holds a joint, which has no handle in the scene."""
         return Grip.from_text(self.grip).is_joint
+
+    @property
+    def device_delay(self) -> float:
+        """Delay t_d in s that the device states, in whole ticks, rounded up."""
+        return whole_ticks(self.guarding.stated_delay, self.period) * self.period
 
     @property
     def levels_on_tool(self) -> tuple[float, float]:

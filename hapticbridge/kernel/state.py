@@ -399,7 +399,7 @@ class BoundKernel:
         bind_guard(s["guard"], parameters)
         bind_observer(s["observer"], parameters.guarding)
         bind_watch(s["watch"], parameters)
-        bind_timing(s["timing"], parameters.guarding.stated_delay)
+        bind_timing(s["timing"], parameters.device_delay)
         bind_shown(s["shown"], parameters)
         is_rigid = parameters.is_rigid and not parameters.scene_ticks and self._meters_scene
         own = replace(parameters, is_rigid=is_rigid)

@@ -1,9 +1,9 @@
 """Energy that the times of samples and forces may have given to the hand, sample by sample.
 
 The condition b >= N assumes that samples come each T and that each force acts a constant time after
-its sample: the stated delay of the device t_d, 0 for one that answers within the tick. In a run,
-samples come late or not at all, and a force is sent some time after its sample. So each run keeps
-the account by which the condition is proved, at the times that it had:
+its sample: the stated delay of the device t_d in whole ticks, 0 for one that answers within one. In
+a run, samples come late or not at all, and a force is sent some time after its sample. So each run
+keeps the account by which the condition is proved, at the times that it had:
 
     A_k = max(A_{k−1} + E_k + u'_k·δp_k + q Δ(W_c + V − V_0), −C),    q = force_scale / scale
 
@@ -104,9 +104,9 @@ def note_motion(s: State, moved: Vector, turned: Vector, lever: float, is_timed:
     store_vector(t.moved[3:], turned)
 
 
-def bind_timing(timing: Part, stated_delay: float) -> None:
-    """Fills in the delay that the device states, in s."""
-    timing["device_delay_ns"] = round(1e9 * stated_delay)
+def bind_timing(timing: Part, delay: float) -> None:
+    """Fills in t_d, in s."""
+    timing["device_delay_ns"] = round(1e9 * delay)
 
 
 @compiled
