@@ -6,6 +6,7 @@ two samples by matrix exponentials, and the hand's energy is what it stores and 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -288,7 +289,7 @@ def test_a_late_device_that_is_certified_gives_no_energy(late: float) -> None:
             delay=late * T,
         )
         ratio = T * 10 ** rng.uniform(-1, 1)
-        most = 0.999 * 2.0 / float(late_minimum_damping(1.0, ratio, T, late * T))
+        most = 0.999 * 2.0 / float(late_minimum_damping(1.0, ratio, T, math.ceil(late) * T))
         law = Coupling(most, ratio * most, 1e-3 * most, 1e-3 * ratio * most)
         summary = run(device, default_method().requested_coupling(law, T), scene=scene)
         certified += summary.is_certified is True

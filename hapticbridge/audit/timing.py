@@ -2,13 +2,13 @@
 
 It is ``kernel.timing`` over whole blocks, from recorded times and poses alone. The wrenches are a
 function of time that is constant between their arrivals, and its integrals between two samples are
-differences of cumulative sums. Resets leave out what the springs held before.
+sums over the parts that arrivals and samples cut.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import accumulate, islice, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,7 +122,9 @@ class TimingTally:
         steps[block.is_first] = 0.0
         is_behind = parameters.device_delay > 0.0
         credit = parameters.guarding.energy_credit_limit if is_behind else 0.0
-        uncovered = _drained(steps, self.uncovered + credit) - credit
+        # one by one, so that no end of a block changes a bit
+        sums = accumulate(steps, lambda a, step: max(a + step, -credit), initial=self.uncovered)
+        uncovered = np.fromiter(islice(sums, 1, None), float, len(steps))
         self.uncovered = float(uncovered[-1])
         if is_behind:
             ratio = parameters.force_scale / parameters.scale
@@ -144,15 +146,18 @@ class TimingTally:
             samples: Their own records.
             lever: r_{k−1}, (n,).
         """
-        parameters, origin = self.parameters, self.arrivals[0]
-        guarding = parameters.guarding
-        ends = 1e-9 * (self.arrivals - origin)
-        held = np.maximum(np.searchsorted(self.arrivals, times, "right") - 1, 0)
-        since = (1e-9 * (times - origin) - ends[held])[:, None]
+        parameters, guarding = self.parameters, self.parameters.guarding
         time = 1e-9 * np.diff(times)[:, None]
         is_late, time = time > _LATE * parameters.period, np.where(time > 0, time, np.inf)
+        points = np.unique(np.concatenate([self.arrivals, times]))
+        points = points[(points >= times[0]) & (points <= times[-1])]
+        held = np.maximum(np.searchsorted(self.arrivals, points[:-1], "right") - 1, 0)
+        parts = 1e-9 * np.diff(points)[:, None]
+        begins = np.minimum(np.searchsorted(points, times[:-1]), max(len(parts) - 1, 0))
+        if len(parts) == 0:
+            return np.zeros(len(samples))
         impulse, square = (
-            np.diff(_integral(ends, values)[held] + since * values[held], axis=0)
+            np.add.reduceat(parts * values[held], begins, axis=0)
             for values in (self.wrenches, self.wrenches**2)
         )
         moved = samples["device_position"] - before["device_position"]
@@ -177,15 +182,3 @@ class TimingTally:
         self.longest_silence = max(self.longest_silence, int(np.diff(ends).max()))
         self.newest_result = int(ends[-2])
         self.scene_steps = int(ticks["scene_step"][-1])
-
-
-def _integral(times: Array, values: Array) -> Array:
-    """Returns the integral up to each time of values that hold from their times on, (n, 6)."""
-    parts = np.diff(times)[:, None] * values[:-1]
-    return np.concatenate([np.zeros((1, 6)), np.cumsum(parts, axis=0)])
-
-
-def _drained(steps: Array, start: float) -> Array:
-    """Returns the running sums max(0, sum + step) from a start >= 0, (n,)."""
-    sums = start + np.cumsum(steps)
-    return np.asarray(sums - np.minimum(np.minimum.accumulate(sums), 0.0))

@@ -188,8 +188,8 @@ class Timekeeping:
         delay_energy: Largest energy in J that delays may have given to the hand.
         conditions: Device conditions at these times.
         in_time: The same for ticks and forces in time.
-        is_kept: True if all conditions hold and the energy is at most ``INSTANT``; None if no
-            condition holds even for a run in time.
+        is_kept: True if all conditions hold and, where all damping is known, the energy is at most
+            ``INSTANT``; None if no condition holds even for a run in time.
         is_realtime: True if real time was requested from the system.
         alarm: Finding of the watch for a late or reversed force; None without one.
         scene_rate: Results per second in Hz that a slower scene was to give; None for another.
@@ -231,6 +231,8 @@ class Timekeeping:
         remedy = _remedy(is_realtime=times.is_realtime, sample_rate=sample_rate)
         late = tuple(_at_times(each, parameters, least, times, remedy) for each in conditions)
         verdicts = [each.holds for each in late if each.available is not None]
+        is_known = all(each.available is not None for each in conditions if each.is_felt)
+        is_paid = times.delay_energy <= INSTANT
         is_borne = bool(verdicts) and all(each.holds is not False for each in conditions)
         return cls(
             rate=least / parameters.period if times.ticks else 0.0,
@@ -241,7 +243,7 @@ class Timekeeping:
             delay_energy=times.delay_energy,
             conditions=late,
             in_time=tuple(conditions),
-            is_kept=all(verdicts) and times.delay_energy <= INSTANT if is_borne else None,
+            is_kept=all(verdicts) and (is_paid or not is_known) if is_borne else None,
             is_realtime=times.is_realtime,
             alarm=Alarm.of(times.flags),
             scene_rate=1.0 / parameters.scene_period if parameters.scene_ticks else None,
