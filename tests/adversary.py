@@ -78,12 +78,13 @@ def _shorten(v: NDArray[np.float64], most: float) -> None:
 
 
 @compiled
-def _turn(q: NDArray[np.float64], turn: NDArray[np.float64]) -> None:
-    angle = np.sqrt(np.sum(turn * turn))
+def turn(q: NDArray[np.float64], step: NDArray[np.float64]) -> None:
+    """Turns a quaternion by a rotation vector in rad."""
+    angle = np.sqrt(np.sum(step * step))
     if angle == 0.0:
         return
     c, s = np.cos(0.5 * angle), np.sin(0.5 * angle) / angle
-    x, y, z = s * turn[0], s * turn[1], s * turn[2]
+    x, y, z = s * step[0], s * step[1], s * step[2]
     a, b, e, f = q[0], q[1], q[2], q[3]
     q[0] = c * a - x * b - y * e - z * f
     q[1] = c * b + x * a + y * f - z * e
@@ -157,7 +158,7 @@ def _move_device(
     _shorten(t, FASTEST_TURN * elapsed)
     h.net += np.sum((w[:3] - b / elapsed * d) * d) + np.sum((w[3:] - b_r / elapsed * t) * t)
     h.position[:] += d
-    _turn(h.quaternion, t)
+    turn(h.quaternion, t)
     sample[0].buttons = int(habits[6])
     for i in range(3):
         sample[0].position[i] = h.position[i]

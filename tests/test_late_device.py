@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, SlowClock, recorded, stroke
+from golden_cases import LIGHT
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
@@ -27,6 +28,7 @@ from hapticbridge.demand.loop_setting import LoopSetting
 from hapticbridge.demand.methods import default_method
 from hapticbridge.device import DeviceInfo, Hand, Motion, SimulatedDevice
 from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.recording import read_recording
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.summary import Summary
 from hapticbridge.theory.bounds import (
@@ -326,6 +328,24 @@ def test_forces_later_than_stated_are_counted_where_the_loop_was_late(tmp_path: 
         assert report.timekeeping.delay_energy == pytest.approx(told, rel=1e-6, abs=1e-12)
         found.append(told)
     assert found[1] > found[0]
+
+
+def test_what_the_scene_creates_is_paid_for_a_device_in_time_alone(tmp_path: Path) -> None:
+    scene, path, certified = tmp_path / "light.xml", tmp_path / "run.mcap", []
+    scene.write_text(LIGHT)
+    for delay in (0.0, T):
+        device = ScriptedDevice(stroke, delay=delay, damping=9.0, rotational_damping=9.0)
+        law = Coupling(2400.0, 1.2, 2.4, 1.2e-3)
+        summary = recorded(path, scene, device, law, duration=0.5, method="implicitfast")
+        created = float(read_recording(path).ticks["environment_energy"].max())
+        assert created > 0.01
+        report, given = audit(path), summary.timekeeping.delay_energy
+        assert report.timekeeping is not None
+        assert report.timekeeping.delay_energy == pytest.approx(given, rel=1e-6, abs=1e-12)
+        assert (given > 0.9 * created) is (delay > 0.0)
+        certified.append((summary.is_certified, report.certified))
+        assert ("the scene behind the delay" in summary.timekeeping.fault) is (delay > 0.0)
+    assert certified == [(True, True), (False, False)]
 
 
 def test_the_rate_of_a_slow_device_is_proposed() -> None:

@@ -258,6 +258,12 @@ def test_a_force_that_outlasts_its_spring_is_counted(
     assert report.timekeeping.delay_energy == pytest.approx(kept.delay_energy, rel=1e-6)
 
 
+def test_forces_that_follow_later_than_the_theory_takes_are_not_in_time(tmp_path: Path) -> None:
+    summary, report = felt(tmp_path / "run.mcap", Case({}, {}, lambda _: 80.0, seconds=0.05))
+    assert summary.timekeeping.is_kept is report.certified is False
+    assert summary.timekeeping.mean_delay > 50 * T
+
+
 def test_times_without_a_condition_are_told_and_not_judged(tmp_path: Path) -> None:
     device = ScriptedDevice(stroke, damping=None, rotational_damping=None)
     stalls = dict.fromkeys(range(100), 4)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from adversary import turn
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
@@ -200,16 +201,7 @@ def _move_devices(
         account[0] += given
         for i in range(3):
             samples[hand].position[i] += d[i]
-        q = samples[hand].quaternion
-        angle = np.sqrt(np.sum(t * t))
-        if angle > 0.0:
-            c, n = np.cos(0.5 * angle), np.sin(0.5 * angle) / angle
-            x, y, z = n * t[0], n * t[1], n * t[2]
-            e, f, g, h = q[0], q[1], q[2], q[3]
-            q[0] = c * e - x * f - y * g - z * h
-            q[1] = c * f + x * e + y * h - z * g
-            q[2] = c * g - x * h + y * e + z * f
-            q[3] = c * h + x * g - y * f + z * e
+        turn(samples[hand].quaternion, t)
 
 
 @compiled

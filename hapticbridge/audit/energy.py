@@ -169,7 +169,7 @@ class EnergyBalance:
             the unfelt work, (n,) in J; zero without a hand.
         unpaid_energy: Energy given to the hand beyond what may have paid for it before the tick,
             (n,) in J (``hand_energy.HandEnergy``); zero without a hand.
-        stored: q (W_c + V − V_0) of ``kernel.timing`` after each tick, (n,) in J.
+        coupling_account: q (W_c + V − V_0) of ``kernel.timing`` after each tick, (n,) in J.
         springs: Energy at the hand that the coupling's springs held at the start and after each
             reset, in J.
         input_work: Cumulative work of the scene's inputs without that of resets, (n,) in J.
@@ -189,7 +189,7 @@ class EnergyBalance:
     net_energy: Array
     gross_energy: Array
     unpaid_energy: Array
-    stored: Array
+    coupling_account: Array
     springs: float
     input_work: Array
     released: float
@@ -265,7 +265,7 @@ class EnergyBalance:
             gross_energy=(totals["hand_energy"] - totals["unfelt_work"])
             * parameters.guarding.has_hand,
             unpaid_energy=unpaid * parameters.guarding.has_hand,
-            stored=ratio * (coupling_work + held),
+            coupling_account=ratio * (coupling_work + held),
             springs=float(ratio * totals["start_springs"][-1]),
             input_work=totals["inputs"],
             released=float(totals["released"][-1]),

@@ -248,7 +248,6 @@ class AuditState:
         row: Record of the previous tick, (1,). Before the first tick it holds the poses at the
             start and zeros.
         since_sample: Time in s that the device has been without a new sample.
-        stale_ticks: Ticks that the device has been without a new sample.
         rise_ticks: Ticks in which the share of the wrench rises from 0 to 1.
         start_energy: Kinetic plus potential energy before the first tick, in J.
         sums: Cumulative energies in J, by the names of ``SUMS``.
@@ -256,7 +255,6 @@ class AuditState:
 
     row: NDArray[np.void]
     since_sample: float
-    stale_ticks: int
     rise_ticks: float
     start_energy: float
     sums: dict[str, float]
@@ -280,7 +278,6 @@ class AuditState:
         return cls(
             row=row,
             since_sample=0.0,
-            stale_ticks=0,
             rise_ticks=float(parameters.ramp_ticks),
             start_energy=float(starts["start_kinetic"][0] + starts["start_potential"][0]),
             sums=dict.fromkeys(SUMS, 0.0),

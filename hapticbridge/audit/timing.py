@@ -92,7 +92,7 @@ class TimingTally:
         lateness = 1e-9 * (rows["read_ns"] - rows["deadline_ns"])
         self.jitter += float(np.sum(np.maximum(np.diff(lateness), 0.0)))
         if parameters.has_law:
-            self._add_account(block, balance.stored)
+            self._add_account(block, balance.coupling_account)
 
     def _add_account(self, block: AuditedBlock, stored: Array) -> None:
         """Adds what late samples and forces may have given."""

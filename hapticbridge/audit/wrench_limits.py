@@ -49,7 +49,6 @@ class AuditedBlock:
         motion: Motion of handle and tool.
         is_first: True for the first tick after a start or a pause without force, (n,).
         interval: Time in s since the device's last new sample, at least T between readings, (n,).
-        sample_ticks: Ticks since the device's last new sample, at least 1, (n,).
         lever_before: r_{k−1}, the part of the device's motion that the handle made, (n,).
         rise_ticks: Ticks in which r rises from 0 to 1, (n,).
         scene_ticks: Ticks between two results of a slower scene; 0 for another.
@@ -61,7 +60,6 @@ class AuditedBlock:
     motion: Motion
     is_first: Flags
     interval: Array
-    sample_ticks: NDArray[np.int64]
     lever_before: Array
     rise_ticks: Array
     scene_ticks: int
@@ -92,7 +90,6 @@ class AuditedBlock:
             motion=Motion.from_records(ticks, state, events, before),
             is_first=is_first,
             interval=_sample_intervals(ticks, state, parameters.period),
-            sample_ticks=_sample_ticks(ticks, state),
             lever_before=before,
             rise_ticks=rise,
             scene_ticks=parameters.scene_ticks,
@@ -105,7 +102,6 @@ class AuditedBlock:
             self.state,
             row=row.copy(),
             since_sample=float(self.interval[-1] * has_flag(row, TickFlag.STALE_SAMPLE)[0]),
-            stale_ticks=int(self.sample_ticks[-1] * has_flag(row, TickFlag.STALE_SAMPLE)[0]),
             rise_ticks=float(self.rise_ticks[-1]),
             sums=sums,
         )
@@ -119,13 +115,6 @@ def first_lever(parameters: RunParameters) -> float:
 def newest(is_on: Flags) -> NDArray[np.int64]:
     """Returns the newest row that is True up to each row; -1 before the first."""
     return np.maximum.accumulate(np.where(is_on, np.arange(len(is_on)), -1))
-
-
-def _sample_ticks(ticks: NDArray[np.void], state: AuditState) -> NDArray[np.int64]:
-    count = np.arange(len(ticks))
-    last = newest(~has_flag(ticks, TickFlag.STALE_SAMPLE))
-    before = np.concatenate([[-1], last[:-1]])  # row of the last new sample
-    return np.asarray(np.where(before < 0, count + 1 + state.stale_ticks, count - before))
 
 
 def _sample_intervals(ticks: NDArray[np.void], state: AuditState, period: float) -> Array:

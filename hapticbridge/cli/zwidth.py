@@ -14,12 +14,7 @@ from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progr
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import DampingCondition, conditions_of
-from hapticbridge.demand.loop_setting import (
-    IN_TIME,
-    Lag,
-    LoopSetting,
-    delay_ticks,
-)
+from hapticbridge.demand.loop_setting import IN_TIME, Lag, LoopSetting, delay_ticks
 from hapticbridge.demand.methods import RunCoupling, default_method
 from hapticbridge.demand.plots import (
     Alternative,

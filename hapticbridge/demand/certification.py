@@ -110,7 +110,7 @@ class Certification:
 
     @property
     def answer(self) -> str:
-        """Verdict in a table; ``if timely``: no measurement confirms that there is no delay."""
+        """Verdict in a table; ``if timely``: no measurement confirms the delay."""
         if self.verdict:
             return "if timely" if self._if else "yes"
         return "not judged" if self.verdict is None else "no"

@@ -14,12 +14,7 @@ from hapticbridge.demand.methods import IMPLICIT, Method
 from hapticbridge.device.base import DeviceInfo
 from hapticbridge.errors import CouplingError
 from hapticbridge.kernel.ledger import SLACK_SHARE
-from hapticbridge.kernel.parameters import (
-    ROUNDING,
-    RunParameters,
-    checked_substeps,
-    whole_ticks,
-)
+from hapticbridge.kernel.parameters import ROUNDING, RunParameters, checked_substeps, whole_ticks
 from hapticbridge.theory.bounds import late_minimum_damping, minimum_damping
 from hapticbridge.theory.transfer import delayed_by
 

@@ -36,6 +36,7 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import TickFlag
 from hapticbridge.kernel.swing_watch import PUSH, STAND
 from hapticbridge.theory.bounds import late_minimum_damping
+from hapticbridge.theory.transfer import MAX_DELAY
 from hapticbridge.units import format_si
 
 NOT_KEPT = "the run did not keep its time"
@@ -332,8 +333,10 @@ class Timekeeping:
                 f"({usual.needed:.3g} with every tick in time), and has {usual.available:.3g}"
             )
         else:
+            is_behind = any(each.delay for each in self.in_time)
+            givers = "late samples and forces" + ", and the scene behind the delay," * is_behind
             found = (
-                "late samples and forces may have given the hand "
+                f"{givers} may have given the hand "
                 f"{format_si(self.delay_energy, 'J')}, more than {format_si(INSTANT, 'J')}"
             )
         if self.silence and self.share >= MANY_KEPT and not self.sample_rate:
@@ -392,9 +395,11 @@ def _at_times(
         # samples that did not come: the tool moved in the ticks between them
         count = max(times.ticks / times.new_samples, ticks) if times.new_samples else math.inf
         needed += ratio * kappa * period * count * (count - ticks)
-        delays = condition.delay or 0.0, (condition.delay or 0.0) + times.mean_delay
-        stated, whole = (late_minimum_damping(k, b, period, delay, ticks) for delay in delays)
-        needed += ratio * float(whole - stated)
+        delay = condition.delay or 0.0
+        whole = math.inf  # beyond what the theory takes
+        if delay + times.mean_delay <= MAX_DELAY * ticks * period:
+            whole = float(late_minimum_damping(k, b, period, delay + times.mean_delay, ticks))
+        needed += ratio * (whole - float(late_minimum_damping(k, b, period, delay, ticks)))
     at_times = replace(condition, needed=needed)
     if at_times.holds is False and condition.holds is not False:
         return replace(at_times, remedy=remedy)

@@ -193,15 +193,15 @@ def springs(s: State) -> tuple[Spring, Spring]:
 
 
 @compiled
-def is_bent(spring: Spring, size: float) -> bool:
-    """Returns True if the curve changes a force of the linear law, g(‖u‖) < ‖u‖."""
+def is_beyond_level(spring: Spring, size: float) -> bool:
+    """Returns True if the linear law asks for more than the level, so that the record tells it."""
     return size > spring.level
 
 
 @compiled
-def is_beyond_level(spring: Spring, size: float) -> bool:
-    """Returns True if the linear law asks for more than the level, so that the record tells it."""
-    return size > spring.level
+def is_bent(spring: Spring, size: float) -> bool:
+    """Returns True if the curve changes a force of the linear law, g(‖u‖) < ‖u‖."""
+    return is_beyond_level(spring, size)
 
 
 @compiled

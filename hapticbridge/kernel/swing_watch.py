@@ -74,16 +74,16 @@ swing has p = 0.9, c = −0.04, x > 0.6 and c_s = 0.76; faults have p < 0.6. The
 Steps of 4 mm swing between two samples 40 to 90 times a second and give at most 17 mJ. A device
 that starts from rest moves by 0.1 mm in a tick of 1 ms: 10 N on 0.05 kg.
 
-Limits of the method: a slam gives up to 1.4 J before it is found, and a smaller one some mW for as
-long as it lasts. A motor that holds for 60 ms gives two fingers up to 0.4 J within
-one hold, before a lower force could reach it, and 0.8 J where two throws were needed. A torque 12
-to 20 ms late gives two fingers up to 0.5 J within the throw in which it is found. A torque 2 ms
-later than its device states gives them up to 0.7 J. If a device states no delay, a force 2 ms late
-is not found; it lets light fingers swing, and they get up to 4.7 J within 2.5 s. A weak hand that
-follows a reversed force slowly looks like one that pushes. Exchanged axes and 300 N/m let an arm
-swing at 2 Hz, where the watch sees little, and give up to 7.3 J. A hand stronger than any force, as
-a robot's, whose speed jumps is taken for a late device. A device with prescribed motion is not
-watched (``guard.guard_parameters_for``).
+Limits of the method: a slam gives up to 2 J before it is found (4 kHz; 1.4 J at 1 kHz), and a
+smaller one some mW for as long as it lasts. A motor that holds for 60 ms gives two fingers up to
+0.4 J within one hold, before a lower force could reach it, and 0.8 J where two throws were needed.
+A torque 12 to 20 ms late gives two fingers up to 0.5 J within the throw in which it is found. A
+torque 2 ms later than its device states gives them up to 0.7 J. If a device states no delay, a
+force 2 ms late is not found; it lets light fingers swing, and they get up to 4.7 J within 2.5 s. A
+weak hand that follows a reversed force slowly looks like one that pushes. Exchanged axes and 300
+N/m let an arm swing at 2 Hz, where the watch sees little, and give up to 7.3 J. A hand stronger
+than any force, as a robot's, whose speed jumps is taken for a late device. A device with prescribed
+motion is not watched (``guard.guard_parameters_for``).
 """
 
 from __future__ import annotations

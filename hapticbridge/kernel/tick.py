@@ -150,7 +150,7 @@ from hapticbridge.kernel.tick_guard import (
     refusal,
     send_within,
 )
-from hapticbridge.kernel.timing import note_delay, note_motion
+from hapticbridge.kernel.timing import keep_account, note_motion
 
 LOOP_DTYPE = np.dtype(
     [
@@ -777,7 +777,7 @@ def finish_tick(
     if code != OK:
         return code
     for i in range(state.size):
-        note_delay(state[i], deadline_ns, read_ns, write_ns)
+        keep_account(state[i], deadline_ns, read_ns, write_ns)
         row[i].flags |= state[i].loop.external_flags
     taken = publish(row, ring, cursors, deadline_ns, wake_ns, read_ns, write_ns, flags)
     return OK if taken else RING_FULL

@@ -19,19 +19,19 @@ and for the motion δp_k within the time τ, however it was spread, with the mea
     E_k = w̄·δp_k − b ‖δp_k‖²/τ + ∫ ‖w(t) − w̄‖² dt/(4 b)
 
 which is never more. r is the lever: the handle moved by r_{k−1} times the device's motion. The
-first is taken, so that A holds what another hand could have had at the same forces. After a late
-sample it is the second: then the handle slips for the motion that there was
-(``law.charge_lateness``). In ticks without a new sample the device may have held the force of the
-last one, so that no other enters w.
+first is taken, so that A holds what another hand could have had at the same forces. For a sample
+that comes late, or in some ticks only, it is the second: then the handle slips for the motion that
+there was (``law.charge_lateness``). In ticks without a new sample the device may have held the
+force of the last one, so that no other enters w.
 
 C is 0 for a device in time. Behind a delay it is the energy credit of the passivity controller:
 what wrenches on their way will cost, motion has paid for before.
 
 No property of the law is assumed: force level, slip, lever, changed gains, contacts, several hands
 and slower scenes are all in W_c and V. From any sample on, the hand gets at most A + C + q V, and
-what the scene had or created. In a strict scene with b >= N and constant times, A stays near 0;
-see ``theory.bounds.late_minimum_damping``. What a scene within its slack created
-is added to A for a device that answers late: only the condition of a device in time pays for it.
+what the scene had or created. In a strict scene with b >= N and constant times, A stays near 0; see
+``theory.bounds.late_minimum_damping``. What a scene within its slack created is added to A for a
+device that answers late: only the condition of a device in time pays for it.
 
 References:
     Brown & Colgate 1997, eq. (6); the account is its proof in the time domain.
@@ -155,7 +155,7 @@ def _stored(s: State) -> float:
 
 
 @compiled
-def note_delay(s: State, deadline_ns: int, read_ns: int, write_ns: int) -> None:
+def keep_account(s: State, deadline_ns: int, read_ns: int, write_ns: int) -> None:
     """Notes the times of a tick after its wrench was sent, and keeps the account.
 
     Args:
