@@ -62,6 +62,13 @@ def hand(folder: Path) -> Path:
     return path
 
 
+def carried(folder: Path) -> Path:
+    """The scene carries the weight of a tool that falls."""
+    path = folder / "carried.mcap"
+    recorded(path, duration=0.05, tool_weight=False)
+    return path
+
+
 def busy(folder: Path) -> Path:
     """Commands, inputs, a mark and missed deadlines."""
     path = folder / "busy.mcap"
@@ -250,6 +257,12 @@ def other_sheet(recording: Recording, **values: Any) -> Parts:
     return {"meta": changed | {"guard": json.dumps(old | own)}}
 
 
+def other_reason(recording: Recording) -> Parts:
+    """Replaces the sentence on the carried weight."""
+    *changes, _ = json.loads(recording.meta["scene_changes"])
+    return {"meta": {"scene_changes": json.dumps([*changes, "the tool is a feather"])}}
+
+
 def no_trip(recording: Recording) -> Parts:
     """Removes the trip, and lets the run end by itself."""
     kept = [e for e in recording.events if e["event"] != "trip"]
@@ -310,6 +323,7 @@ UNREACHED = "a limit that the run never reached: an honest run with it has the s
 OWN_WORD = "a statement of the user or the machine, that nothing else in the file depends on"
 LESS = "it claims less: an uncertified device, or a run without a guard"
 PUNCTUAL = "an honest run that met all its deadlines has these records"
+FOR_READERS = "a sentence for readers; the compiled model holds what it tells"
 SHORTER = "an honest run that ended earlier has these records"
 
 NO_WRITES: tuple[Any, ...] = (
@@ -409,6 +423,10 @@ FORGERIES: dict[str, Forgery] = {
     "scene name": seen(hand, text(scene="harmless")),
     "scene file": seen(hand, text(scene_file="harmless.xml")),
     "scene changes": again(hand, text(scene_changes='["none"]')),
+    "weight of the tool": again(hand, text(tool_weight="carried")),
+    "weight that was asked to be carried": seen(carried, text(tool_weight="felt")),
+    "reason why a weight is carried": hidden(carried, other_reason, FOR_READERS),
+    "weight of the tool in another word": seen(hand, text(tool_weight="light")),
     "scene hash": again(hand, text(scene_sha256="0" * 64)),
     "start state": again(hand, attached(STATE_ATTACHMENT, lambda data: data[:-8] + b"\1" * 8)),
     "no start state": Forgery(hand, dropped(STATE_ATTACHMENT), "unverified", "unverified"),
@@ -527,7 +545,7 @@ def test_the_honest_recordings_are_what_the_forgeries_hide(
     honest: Callable[[Any], Recording],
 ) -> None:
     expected = {hand: "passive", busy: "passive", tripped: "passive"}
-    expected |= {swung: "active", weighed: "passive"}
+    expected |= {swung: "active", weighed: "passive", carried: "passive"}
     for run, verdict in expected.items():
         report = audit(honest(run).path)
         assert (report.verdict, report.resimulation) == (verdict, "bit for bit"), report.reason

@@ -21,6 +21,8 @@ from hapticbridge.files import read_json
 from hapticbridge.kernel.parameters import GuardParameters
 from hapticbridge.recording import RecordingFile
 from hapticbridge.run.description import (
+    CARRIED,
+    FELT,
     SOURCE_PREFIX,
     STATE_ATTACHMENT,
     metas_of,
@@ -75,6 +77,11 @@ def metadata_statements(recordings: Sequence[RecordingFile]) -> Iterator[Stateme
     if main is not None:
         name = PurePosixPath(main).name
         yield Statement("the requested scene", request.scene, name, "the sources")
+    # with the option at its default the device decides, and the compiled scene tells
+    words = (FELT, CARRIED) if request.options.tool_weight else (CARRIED,)
+    stated = meta.get("tool_weight")
+    expected = stated if stated in words else words[0]
+    yield Statement("metadata 'tool_weight'", stated, expected, source)
     for setup, own in zip(setups_of(meta), metas_of(meta), strict=True):
         stored = parameters_of(own)
         with refused_request():

@@ -190,8 +190,8 @@ def processor() -> str:
 
 SOURCE_PREFIX = "scene/"
 
-CARRIED = "carried"
-"""Value of ``tool_weight`` in the metadata if the scene compensates the tool's weight."""
+FELT, CARRIED = "felt", "carried"
+"""Values of ``tool_weight`` in the metadata; it is carried if the scene compensates the weight."""
 
 _FLOATS = tuple(
     name for name, kind in types_of(RunParameters).items() if kind is float and name != "period"
@@ -240,7 +240,7 @@ def describe_parameters(parameters: RunParameters) -> dict[str, str]:
 def describe_scene(scene: Scene) -> dict[str, str]:
     """Returns the metadata of a prepared scene."""
     return {
-        "tool_weight": CARRIED if scene.is_carried else "felt",
+        "tool_weight": CARRIED if scene.is_carried else FELT,
         "scene_changes": json.dumps(scene.changes, ensure_ascii=False),
         "scene_parameters": json.dumps(scene.parameters),
         "scene_sha256": model_digest(scene.model),
