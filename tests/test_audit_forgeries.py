@@ -391,6 +391,7 @@ FORGERIES: dict[str, Forgery] = {
     "guard: a delay and no margin": seen(
         hand, entry("guard", stated_delay=0.05, delay_margin="inf")
     ),
+    "guard: resolution": seen(hand, entry("guard", resolution=5e-5)),
     "guard: no margin": seen(hand, entry("guard", delay_margin="inf")),
     "guard: stated delay": seen(hand, entry("guard", stated_delay=0.05)),
     "guard: idle force": seen(hand, guard("idle_force", 2.0)),

@@ -62,7 +62,7 @@ def test_a_late_device_that_has_the_damping_is_certified_for_its_delay(tmp_path:
     for found in (summary.certification, audit(path).certification):
         assert found is not None
         assert found.standing is Standing.CERTIFIED
-        assert found.words == f"device certified: {words}"
+        assert found.words == f"device certified: {words}; its encoder's steps are unknown"
 
 
 def test_a_late_device_that_lacks_damping_is_told_the_number_of_its_own_bound(

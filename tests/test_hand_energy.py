@@ -130,6 +130,7 @@ FLOATING = SPHERE.format(gravity=0, mass=0.3)
         (WEIGHT, {"clock": SlowClock({200: 4}, dict.fromkeys(range(300, 900, 7), 0.3))}),
         (FLOATING, {"on_tick": push}),
         (DRIVEN, {"on_tick": drive}),
+        (DRIVEN, {"on_tick": drive, "device": "simulated:resolution=1e-5"}),
         (BESIDE.format(mass=1.0), {"on_tick": drive}),
         (PUMP, {"duration": 2.0, "controller": "off"}),
     ],

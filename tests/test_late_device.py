@@ -24,9 +24,11 @@ from hapticbridge.audit import audit
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import conditions_of, default_coupling
+from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.loop_setting import LoopSetting
 from hapticbridge.demand.methods import default_method
 from hapticbridge.device import DeviceInfo, Hand, Motion, SimulatedDevice
+from hapticbridge.errors import SafetyTrip
 from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
 from hapticbridge.run.bridge import Bridge
@@ -154,13 +156,15 @@ def test_the_default_coupling_of_a_late_device_is_stiffer_than_a_walls_rule() ->
 class OwnDevice:
     """A device of 1 axis in a hand of spring and damper, solved exactly between two ticks.
 
-    ``gained`` is the largest energy in J that the hand stored and burned beyond its start's.
+    ``got`` is the energy in J that the hand stored and burned beyond its start's, ``gained`` the
+    largest so far.
 
     Args:
         hand: Stiffness in N/m and damping in N s/m of the hand.
         every: Ticks per sample; in the others the device holds its force.
         late: Ticks from a sample to its force, by the sample's number; a part of one, too.
         mass: Of hand and handle in kg.
+        step: Of its encoder in m; 0 reads exactly.
         start: Displacement in m and speed in m/s of the hand.
         sheet: Fields of the data sheet.
     """
@@ -172,6 +176,7 @@ class OwnDevice:
         every: int = 1,
         late: Callable[[int], float] = lambda _: 0.0,
         mass: float = 0.1,
+        step: float = 0.0,
         start: tuple[float, float] = (1e-3, 0.05),
         **sheet: Any,
     ) -> None:
@@ -185,7 +190,7 @@ class OwnDevice:
         self.info = DeviceInfo(**usual | {"force_limit": 10.0, "is_real": False} | sheet)
         self.every, self.late, self.mass, self._begin = every, late, mass, start
         self.stiffness, self.damping = hand
-        self.gained = 0.0
+        self.step, self.got, self.gained = step, 0.0, 0.0
 
     def start(self, period: float) -> NDArray[np.void]:
         b = float(self.info.damping or 0.0) + self.damping
@@ -198,8 +203,12 @@ class OwnDevice:
         self._forces: list[tuple[float, float]] = []  # when they act, in ticks, and their size
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._sample["quaternion"][0, 0] = 1.0
-        self._sample["position"][0, 0] = self._state[0]
+        self._sample["position"][0, 0] = self._place()
         return self._sample
+
+    def _place(self) -> float:
+        x = float(self._state[0])
+        return self.step * round(x / self.step) if self.step else x
 
     def _solved(self, share: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Returns the step of a share of a tick, and ∫ v² dt over it as a form of the state."""
@@ -227,10 +236,11 @@ class OwnDevice:
             self._move(round(max(at - now, 0.0), 9))
             now, self._state[2] = max(at, now), force
         self._move(round(self._ticks - now, 9))
-        self.gained = max(self.gained, self._stored() + self._burned - self._start)
+        self.got = self._stored() + self._burned - self._start
+        self.gained = max(self.gained, self.got)
         is_new = self._ticks % self.every == 0
         if is_new:
-            self._sample["position"][0, 0] = self._state[0]
+            self._sample["position"][0, 0] = self._place()
         sample[:] = self._sample
         return 0 if is_new else int(TickFlag.STALE_SAMPLE)
 
@@ -423,4 +433,48 @@ def test_steps_that_are_not_known_are_not_judged() -> None:
     law = default_method().law_coupling(COUPLING, T)
     condition = conditions_of(LoopSetting(info=info, law=law, period=T))[0]
     assert condition.holds is True
-    assert "its resolution is unknown" in condition.sentence()
+    assert "steps are unknown ('hapticbridge identify' measures them)" in condition.sentence()
+
+
+def metered(device: OwnDevice, stiffness: float, **options: Any) -> Any:
+    """Runs a device whose damping does not bear the coupling; returns the observer's account."""
+    law = default_method().requested_coupling(Coupling(stiffness, 0.0, 2.4, 5e-4), T)
+    with Bridge("virtual_wall", device, law, clock=SimulatedClock(), **options) as bridge:
+        bridge.run(5.0)
+        return bridge.session.kernel.state["observer"][0].copy()
+
+
+def test_the_energy_to_a_hand_is_known_up_to_what_steps_hide() -> None:
+    rng, is_exceeded = np.random.default_rng(7), []
+    for _ in range(10):
+        step = 10 ** rng.uniform(-4.5, -3.5)
+        hand, mass = (10 ** rng.uniform(1, 5), 10 ** rng.uniform(-1, 0.5)), rng.uniform(0.05, 0.5)
+        start = rng.uniform(0, 5e-3), rng.uniform(0, 0.5)
+        for stated in (step, None):
+            device = OwnDevice(hand, mass=mass, step=step, start=start, resolution=stated)
+            k = 10 ** rng.uniform(3, 4.5)
+            found = metered(device, k, controller="off", limits=Limits(energy=math.inf))
+            known = found["net_device_energy"] + found["hidden_energy"]
+            if stated is None:
+                is_exceeded.append(device.got > known + 1e-6)
+            else:
+                assert device.got <= known + 1e-9
+    assert any(is_exceeded)  # by the positions as they were read
+
+
+def test_steps_that_are_stated_are_not_taken_for_energy() -> None:
+    for stated in (2e-4, None):
+        device = OwnDevice((2.0, 0.1), step=2e-4, start=(0.03, 1.0), resolution=stated)
+        if stated is None:
+            with pytest.raises(SafetyTrip, match=r"the hand (got|would get) more"):
+                metered(device, 20_000.0)
+        else:
+            assert metered(device, 20_000.0)["hidden_energy"] > 0.05
+        assert device.gained < 1e-6
+
+
+def test_energy_beyond_what_steps_hide_ends_the_run() -> None:
+    device = OwnDevice((2e5, 0.5), step=STEP, resolution=STEP)
+    with pytest.raises(SafetyTrip, match="the hand would get more"):
+        metered(device, 20_000.0, controller="off")
+    assert device.gained < 0.1

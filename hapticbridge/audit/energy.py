@@ -158,13 +158,17 @@ class EnergyBalance:
         device_throughput: Cumulative sum of that energy's absolute values, (n,) in J.
         environment_energy: S_k − S_start − works, with the ``coupling_work`` above, (n,) in J.
         slack: Σ ½ (K + B'/T) ‖δx‖² + ½ (K_r + B'_r/T) ‖δφ‖² below the force level, (n,) in J.
-        excess_device_energy: Energy given to the device beyond its dissipation, the energy
-            released by scene and coupling since the start, and the unfelt work (``unfelt_work``),
-            (n,) in J. Zero for an unknown damping or several laws per tick. With a coupling law,
-            energy created by the environment is not included; it belongs to the other port.
+        excess_device_energy: Energy given to the device beyond its dissipation, what steps of the
+            encoder may have added, the energy released by scene and coupling since the start, and
+            the unfelt work (``unfelt_work``), (n,) in J. Zero for an unknown damping or several
+            laws per tick. With a coupling law, energy created by the environment is not included;
+            it belongs to the other port.
         net_energy: Energy given to the hand beyond what the device's damping burned, less what the
-            scene's storage had given before the tick (``released``), (n,) in J; zero without a
-            hand. It is what the guard's energy limit bounds, with the damping that the guard takes.
+            scene's storage had given before the tick (``released``) and what steps of the encoder
+            may have added, (n,) in J; zero without a hand. It is what the guard's energy limit
+            bounds, with the damping that the guard takes.
+        hidden_energy: The most in J that steps of the encoder may have hidden or added until the
+            last tick (``passivity_controller.observe_energy``).
         gross_energy: Energy given to the hand beyond what the device's damping burned and beyond
             the unfelt work, (n,) in J; zero without a hand.
         unpaid_energy: Energy given to the hand beyond what may have paid for it before the tick,
@@ -187,6 +191,7 @@ class EnergyBalance:
     slack: Array
     excess_device_energy: Array
     net_energy: Array
+    hidden_energy: float
     gross_energy: Array
     unpaid_energy: Array
     coupling_account: Array
@@ -262,6 +267,7 @@ class EnergyBalance:
             slack=totals["slack"],
             excess_device_energy=excess,
             net_energy=net * parameters.guarding.has_hand,
+            hidden_energy=float(totals["hidden_energy"][-1]) * parameters.guarding.has_hand,
             gross_energy=(totals["hand_energy"] - totals["unfelt_work"])
             * parameters.guarding.has_hand,
             unpaid_energy=unpaid * parameters.guarding.has_hand,
@@ -284,7 +290,7 @@ def _device_excess(
     lost = np.minimum(created, 0.0) if parameters.has_law else created
     released = totals["coupling_work"] + in_springs
     excess = totals["delayed_device_energy"] - totals["device_dissipation"]
-    excess = excess - totals["unfelt_work"]
+    excess = excess - totals["unfelt_work"] - totals["hidden_energy"]
     return np.asarray(excess + parameters.force_scale / parameters.scale * (lost + released))
 
 
@@ -303,7 +309,7 @@ def _hand_energies(
         np.concatenate([[before[name]], totals[name][:-1]]) for name in ("released", "taken")
     )
     totals["forgotten"] = _summed(np.where(is_reset, stored, 0.0), before["forgotten"])
-    net = totals["hand_energy"] - ratio * (np.where(is_reset, 0.0, stored) + totals["forgotten"])
+    net = totals["guarded_energy"] - ratio * (np.where(is_reset, 0.0, stored) + totals["forgotten"])
     released = np.maximum(totals["start_springs"] - taken, 0.0)
     return net, totals["hand_energy"] - totals["unfelt_work"] - ratio * released
 
@@ -363,21 +369,31 @@ def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict
     gains = events.gains(ticks["tick"])
     unfelt = unfelt_work(parameters, gains, whole, rows["lever"][: len(ticks)], (moved, turned))
     late = np.sum(sent[:, :3] * late_moved, axis=1) + np.sum(sent[:, 3:] * late_turned, axis=1)
-    dissipation = np.zeros(len(ticks))
+    dissipation, guarding = np.zeros(len(ticks)), parameters.guarding
+    least, late_least = (
+        np.maximum(np.abs(each) - guarding.resolution, 0.0) for each in (moved, late_moved)
+    )
     if parameters.device_damping is not None:
         parts = dissipated_by_damping(
-            parameters, late_moved, late_turned, block.interval, ~block.is_first
+            parameters, late_least, late_turned, block.interval, ~block.is_first
         )
         dissipation = _summed(parts, before["device_dissipation"])
-    guarding = parameters.guarding
     assumed = replace(
         parameters,
         device_damping=guarding.assumed_damping,
         device_rotational_damping=guarding.assumed_rotational_damping,
     )
     burned = dissipated_by_damping(assumed, moved, turned, block.interval, ~block.is_first)
+    shown = dissipated_by_damping(assumed, least, turned, block.interval, ~block.is_first)
+    # Σ w·ε with errors of half a step, by summation by parts
+    forces = np.vstack([[before[f"sent_{axis}"] for axis in "xyz"], sent[:, :3]])
+    changes = np.abs(np.diff(forces, axis=0)) + np.diff(np.abs(forces), axis=0)
+    hidden = 0.5 * guarding.resolution * np.sum(changes, axis=1)
     return {
         "hand_energy": _summed(work - burned, before["hand_energy"]),
+        "guarded_energy": _summed(work - shown - hidden, before["guarded_energy"]),
+        "hidden_energy": _summed(hidden, before["hidden_energy"]),
+        **{f"sent_{axis}": sent[:, i] for i, axis in enumerate("xyz")},
         "device_energy": _summed(work, before["device_energy"]),
         "device_throughput": _summed(np.abs(work), before["device_throughput"]),
         "delayed_device_energy": _summed(late, before["delayed_device_energy"]),

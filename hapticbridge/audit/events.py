@@ -227,6 +227,8 @@ SUMS = (
     "discarded",
     "start_springs",
     "hand_energy",
+    "guarded_energy",
+    "hidden_energy",
     "created",
     "motors",
     "external",
@@ -236,8 +238,11 @@ SUMS = (
     "released",
     "taken",
     "forgotten",
+    "sent_x",
+    "sent_y",
+    "sent_z",
 )
-"""Names of the cumulative energies."""
+"""Names of the cumulative energies, and of the force in N that the device held last."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -294,6 +294,7 @@ class PassivityTally:
         last = ticks[-1]
         self.hand_energy = HandEnergy(
             net=max(self.hand_energy.net, float(np.max(balance.net_energy))),
+            hidden=balance.hidden_energy,
             unpaid=max(self.hand_energy.unpaid, float(np.max(balance.unpaid_energy))),
             springs=balance.springs,
             scene=balance.released,
@@ -474,12 +475,15 @@ def verdict_on(
 
 
 def _hand_words(report: AuditReport) -> str:
-    """Returns a clause for each hand that got more than ``INSTANT``; empty without one."""
-    return "; ".join(
-        f"net to the hand{f' at {grip!r}' if grip else ''} {energy.sentence}"
-        for grip, energy in zip(report.hands or ("",), report.hand_energies, strict=True)
-        if energy.net > INSTANT
-    )
+    """Returns clauses on hands that got more than ``INSTANT``, or may have behind steps."""
+    found = []
+    for grip, energy in zip(report.hands or ("",), report.hand_energies, strict=True):
+        at = f" at {grip!r}" if grip else ""
+        if energy.net > INSTANT:
+            found.append(f"net to the hand{at} {energy.sentence}")
+        if energy.blur:
+            found.append(f"encoder steps{at} {energy.blur}")
+    return "; ".join(found)
 
 
 @dataclass(slots=True, kw_only=True)

@@ -150,10 +150,10 @@ class StepCondition:
 
     @classmethod
     def of(cls, loop: LoopSetting) -> StepCondition | None:
-        """Returns the condition; None if the device has no steps, or nothing of them is stated."""
+        """Returns the condition; None if the device has no steps."""
         info, law = loop.info, loop.law
         step = info.resolution
-        if step == 0.0 or (step is None and info.friction is None):
+        if step == 0.0:
             return None
         if step is None:
             return cls(None, info.friction, None)
@@ -175,10 +175,15 @@ class StepCondition:
             return 1.0
         return 1.0 - (self.needed or 0.0) / self.available if self.available else -math.inf
 
+    @property
+    def word(self) -> str:
+        """Judgement without numbers: ``unknown`` without a resolution, else ``not judged``."""
+        return "unknown" if self.resolution is None else "not judged"
+
     def sentence(self) -> str:
         """Describes the condition in a clause, with the remedy if it fails."""
         if self.resolution is None:
-            return "its encoder's steps are not judged: its resolution is unknown"
+            return "its encoder's steps are unknown ('hapticbridge identify' measures them)"
         steps = f"steps of {format_si(self.resolution, 'm')}"
         if self.available is None:
             return (

@@ -122,8 +122,8 @@ class Certification:
             return f"the device {_NO_HAND}"
         if self.verdict:
             steps = [each.steps for each in self.conditions if each.steps is not None]
-            unknown = any(each.holds is None for each in steps)
-            limits = "; its encoder's steps are not judged" if unknown else ""
+            open_steps = next((each for each in steps if each.holds is None), None)
+            limits = "" if open_steps is None else f"; its encoder's steps are {open_steps.word}"
             limits += f", but {self.energy.limit}" if self.energy.limit else ""
             return f"device certified{self.kept.clause}: b >= {self._bound}{self._if}{limits}"
         if self.verdict is None:

@@ -384,6 +384,7 @@ def guard_parameters_for(
             math.inf if info.rotational_inertia is None else info.rotational_inertia / period,
         ),
         energy_credit_limit=ENERGY_CREDIT,
+        resolution=info.resolution or 0.0,
         has_hand=True,
         stale_ticks=math.ceil(STALE_PERIODS * own / period),
         speed=JUMP_MARGIN * info.speed_limit if info.speed_limit > 0 else math.inf,

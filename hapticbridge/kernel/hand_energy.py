@@ -46,8 +46,11 @@ class HandEnergy:
     port counts as pushing by its own work and by ``gross``, which does not depend on R.
 
     Attributes:
-        net: Largest E − q R in J with R of ``passivity_controller.observe_release``; the guard's
-            energy limit bounds it.
+        net: Largest E − H − q R in J with R of ``passivity_controller.observe_release``; the
+            guard's energy limit bounds it. E counts here with the least dissipation that the
+            positions show.
+        hidden: H in J, the most that steps of the encoder may have hidden or added; 0 for exact
+            positions and for an unknown resolution (``passivity_controller.observe_energy``).
         unpaid: Largest unpaid energy in J.
         springs: q V_0 in J.
         scene: R, energy in J that the scene's storage has given to the hand.
@@ -62,6 +65,7 @@ class HandEnergy:
     """
 
     net: float = 0.0
+    hidden: float = 0.0
     unpaid: float = 0.0
     springs: float = 0.0
     scene: float = 0.0
@@ -101,6 +105,11 @@ class HandEnergy:
         )
 
     @property
+    def blur(self) -> str:
+        """Energy that no meter of stepped positions sees, as a clause; empty without steps."""
+        return f"may hide {format_energy(self.hidden)} to the hand" if self.hidden else ""
+
+    @property
     def sentence(self) -> str:
         """Net energy and its origin, as far as it is known."""
         beyond = ["what it put in"]
@@ -113,7 +122,7 @@ class HandEnergy:
         if self.springs > INSTANT:
             springs = format_energy(self.springs)
             origins.append(f"the coupling's springs held {springs} at the start or after resets")
-        if self.fault:
+        if self.fault and self.unpaid > self.hidden:
             origins.append(f"nothing paid for {format_energy(self.unpaid)} of it")
         if not origins:
             beyond.append("what the device's damping burned")

@@ -49,6 +49,7 @@ class GuardParameters:
         max_damping: Largest damping in N s/m that the controller adds on an axis.
         max_rotational_damping: Largest damping in N m s/rad that it adds on an axis.
         energy_credit_limit: Largest energy in J that earlier dissipation may pay for.
+        resolution: Step in m of the positions that the device reports; 0 if exact or unknown.
         stale_ticks: Ticks in a row without a new sample after which the wrench fades; 0 for never.
         fade_ticks: Ticks in which the wrench fades to zero.
         has_hand: True if a hand holds the device. The handle then does not follow what the device
@@ -88,6 +89,7 @@ class GuardParameters:
     max_damping: float = option(0.0, unit="N s/m", least=0.0)
     max_rotational_damping: float = option(0.0, unit="N m s/rad", least=0.0)
     energy_credit_limit: float = option(0.0, unit="J", least=0.0)
+    resolution: float = option(0.0, unit="m", least=0.0)
     stale_ticks: int = _mask()
     fade_ticks: int = option(1, least=1, most=2**MAX_BUTTONS - 1)
     has_hand: bool = False

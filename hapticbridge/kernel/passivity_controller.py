@@ -14,6 +14,7 @@ from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, Part, State
 from hapticbridge.kernel.hand_energy import INSTANT
 from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import held_energy, pulled
+from hapticbridge.kernel.ledger import least_motion
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, GuardParameters
 from hapticbridge.kernel.pose import Vector, norm, scaled
 
@@ -52,6 +53,9 @@ OBSERVER_DTYPE = np.dtype(
         ("max_damping", "<f8"),
         ("max_rotational_damping", "<f8"),
         ("energy_credit_limit", "<f8"),
+        ("resolution", "<f8"),
+        ("hidden_energy", "<f8"),
+        ("earlier_force", "<f8", 3),
         ("observed_energy", "<f8"),
         ("net_device_energy", "<f8"),
         ("guarded_energy", "<f8"),
@@ -82,15 +86,16 @@ OBSERVER_DTYPE = np.dtype(
     ]
 )
 """Sub-record ``observer``, written by this module alone; symbols in ``observe_energy``. Dampings in
-N s/m and N m s/rad, energies in J, velocities in m/s and rad/s. ``max_guarded_energy`` is the
-largest ``guarded_energy`` so far. ``hand_energy`` is Σ (w·δp − b ‖δp‖²/t − W_u) with its largest
-value, ``springs`` the energy of the coupling's springs at the start and after each reset,
-``max_unpaid_energy`` the largest unpaid energy (``hand_energy.HandEnergy``), ``first_unpaid`` the
-first tick in which it was more than ``hand_energy.INSTANT``, −1 for none. ``released`` and
-``pushed`` are R and m of ``observe_release``; ``input_work`` is the external work without that of
-resets. ``peak_*`` are the works of largest size, ``previous_*`` those and Σ E one tick before;
-``work_at_reset`` is W_c at the last reset, ``is_reset`` 1 in the tick after it. ``reversals`` holds
-one bit per tick."""
+N s/m and N m s/rad, energies in J, velocities in m/s and rad/s. ``resolution`` is Δ in m,
+``hidden_energy`` H of ``observe_energy``, ``earlier_force`` the force on the device one tick before
+the last in N. ``max_guarded_energy`` is the largest ``guarded_energy`` so far. ``hand_energy`` is Σ
+(w·δp − b ‖δp‖²/t − W_u) with its largest value, ``springs`` the energy of the coupling's springs at
+the start and after each reset, ``max_unpaid_energy`` the largest unpaid energy
+(``hand_energy.HandEnergy``), ``first_unpaid`` the first tick in which it was more than
+``hand_energy.INSTANT``, −1 for none. ``released`` and ``pushed`` are R and m of
+``observe_release``; ``input_work`` is the external work without that of resets. ``peak_*`` are the
+works of largest size, ``previous_*`` those and Σ E one tick before; ``work_at_reset`` is W_c at the
+last reset, ``is_reset`` 1 in the tick after it. ``reversals`` holds one bit per tick."""
 
 
 def bind_observer(observer: Part, guarding: GuardParameters) -> None:
@@ -101,6 +106,7 @@ def bind_observer(observer: Part, guarding: GuardParameters) -> None:
     observer["max_damping"] = guarding.max_damping
     observer["max_rotational_damping"] = guarding.max_rotational_damping
     observer["energy_credit_limit"] = guarding.energy_credit_limit
+    observer["resolution"] = guarding.resolution
     observer["first_unpaid"] = -1
 
 
@@ -162,13 +168,14 @@ def observe_release(s: State) -> None:
 def guarded_energy(s: State) -> float:
     """Returns the energy in J that the guard limits: what the device got beyond the hand's work.
 
-        G − q R,    q = force_scale / scale
+        G − H − q R,    q = force_scale / scale
 
-    G is the sum of w·δp − b ‖δp‖²/t in J. What the scene's storage has given, R of
+    G is the sum of w·δp − b Σ_i max(|δp_i| − Δ, 0)²/t in J, H of ``observe_energy`` the most that
+    steps of the encoder have added to it. What the scene's storage has given, R of
     ``observe_release``, is not energy from nowhere.
     """
-    ratio = s.run.force_scale / s.run.scale
-    return float(s.observer.net_device_energy - ratio * s.observer.released)
+    observer, ratio = s.observer, s.run.force_scale / s.run.scale
+    return float(observer.net_device_energy - observer.hidden_energy - ratio * observer.released)
 
 
 @compiled
@@ -241,7 +248,7 @@ def unfelt_work(s: State, moved: Vector, turned: Vector) -> float:
 def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> None:
     """Updates the passivity observer with the previous tick's energy flow.
 
-        A_k = max(A_{k−1} + w_{k−1}·δp_k − b ‖δp_k‖²/t + q (ΔS − W) − W_u, −A_max)
+        A_k = max(A_{k−1} + w_{k−1}·δp_k − b Σ_i max(|δp_i| − Δ, 0)²/t + q (ΔS − W) − W_u, −A_max)
 
     A > 0 means that device and scene together have delivered more energy than they received.
 
@@ -251,11 +258,18 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     motors and of user forces (J); W_u ``unfelt_work`` (J). A_max (J) caps the credit, so that long
     dissipation cannot hide a short active phase.
 
+    **Steps of the encoder.** A position is read to ±Δ/2 (m; Δ = 0 if exact or unknown). The damping
+    then burns no less than b Σ_i max(|δp_i| − Δ, 0)²/t. The work of the force is known to ±H:
+
+        H = (Δ/2) Σ_i (Σ_k |w_{k−1,i} − w_{k−2,i}| + |w_{k−1,i}|)
+
+    by summation by parts of Σ w·ε with the errors |ε_i| <= Δ/2.
+
     Also updated, each in J:
         ``created_energy``: Σ E_k of the environment minus its slack, and at least −A_max.
         ``guarded_energy``: result of the function of that name. If a motor in the scene
         pushes the hand, that energy counts as excess, and so does unfelt work.
-        ``max_hand_energy``: largest Σ (w·δp − b ‖δp‖²/t − W_u).
+        ``max_hand_energy``: largest Σ (w·δp − b ‖δp‖²/t − W_u), of the positions that were read.
         ``max_unpaid_energy``: largest Σ (w·δp − b ‖δp‖²/t − W_u) − q max(V_0 − W_c − P, 0), with
         the springs' energy V_0, the coupling's work W_c and P = max(Σ E, 0).
 
@@ -283,19 +297,27 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     observer.previous_net_storage = net
     # before the first tick and in a pause, the time that the device took to move is unknown
     rate = 1.0 / interval if s.loop.tick > s.guard.start_tick else 0.0
-    delivered = 0.0
+    delivered = unburnt = held = 0.0
     w, a = s.loop.wrench_on_device, observer.axis_energy
     b, b_r = observer.assumed_damping, observer.assumed_rotational_damping
+    least = least_motion(moved, observer.resolution)
     for i in range(3):
         linear = (w[i] - b * rate * moved[i]) * moved[i]
         angular = (w[3 + i] - b_r * rate * turned[i]) * turned[i]
-        a[i] = max(a[i] + linear, -limit)
+        shown = b * rate * (moved[i] * moved[i] - least[i] * least[i])
+        a[i] = max(a[i] + (linear + shown), -limit)
         a[3 + i] = max(a[3 + i] + angular, -limit)
         delivered += linear + angular
+        unburnt += shown
+        earlier = observer.earlier_force[i]
+        held += abs(w[i] - earlier) + abs(w[i]) - abs(earlier)
+        observer.earlier_force[i] = w[i]
+    observer.hidden_energy += 0.5 * observer.resolution * held
     unfelt = unfelt_work(s, moved, turned)
     gained -= unfelt
-    observer.observed_energy = max(observer.observed_energy + delivered + gained, -limit)
-    observer.net_device_energy += delivered
+    observed = observer.observed_energy + (delivered + unburnt) + gained
+    observer.observed_energy = max(observed, -limit)
+    observer.net_device_energy += delivered + unburnt
     observer.hand_energy += delivered - unfelt
     observer.max_hand_energy = max(observer.max_hand_energy, observer.hand_energy)
     released = observer.springs - max(energy.environment_energy, 0.0) - energy.coupling_work

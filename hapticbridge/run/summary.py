@@ -373,6 +373,8 @@ class Summary:
         yield from energy_rows(self.energies, self.start_potential)
         if self.max_net_energy > INSTANT:
             yield "net to the hand", self.hand_energy.sentence
+        if blur := self.hand_energy.blur:
+            yield "encoder steps", blur
 
     @property
     def max_net_energy(self) -> float:
@@ -507,6 +509,7 @@ def hand_energy(state: NDArray[np.void], parameters: RunParameters) -> HandEnerg
     ratio = parameters.force_scale / parameters.scale
     return HandEnergy(
         net=float(observer["max_guarded_energy"]),
+        hidden=float(observer["hidden_energy"]),
         unpaid=float(observer["max_unpaid_energy"]),
         springs=ratio * float(observer["springs"]),
         scene=float(observer["released"]),
