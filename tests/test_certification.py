@@ -139,7 +139,7 @@ def test_the_search_of_a_late_devices_coupling_takes_little_memory() -> None:
 def test_a_run_on_a_slow_device_says_what_its_own_rate_would_allow(
     call: Called, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    command, opened = "run point_mass --fast --duration 0.05", SimulatedDevice()
+    command, opened = "run point_mass --fast --duration 0.05 --rate 1000", SimulatedDevice()
     monkeypatch.setattr("hapticbridge.cli.run.device_for", lambda *_: opened)
     assert "new samples per second" not in call(*command.split())[2]
     opened = SimulatedDevice()
@@ -147,3 +147,7 @@ def test_a_run_on_a_slow_device_says_what_its_own_rate_would_allow(
     told = " ".join(call(*command.split())[2].split())
     assert "the device gives 250 new samples per second, and each force is held:" in told
     assert "--rate 250 would allow " in told
+    told = " ".join(call("run", "point_mass", "--fast", "--duration", 0.05)[2].split())
+    assert told.count("the loop runs at 250 Hz, as often as the device has a new sample") == 1
+    assert "point_mass on simulated, 250 Hz, method lossless" in told
+    assert "would allow" not in told

@@ -6,6 +6,7 @@ two samples by matrix exponentials, and the hand's energy is what it stores and 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -39,6 +40,7 @@ from hapticbridge.theory.bounds import (
     minimum_damping,
     stiffest_late_coupling,
 )
+from hapticbridge.whatif import what_if
 
 T = 1e-3
 
@@ -271,7 +273,7 @@ def test_a_slow_device_that_is_certified_gives_no_energy(
     every: int, hand: tuple[float, float]
 ) -> None:
     device = OwnDevice(hand, every=every, rate=1000.0 / every)
-    summary = run(device, None)
+    summary = run(device, None, rate=1000.0)
     assert summary.is_certified is True
     assert device.gained < 1e-6
 
@@ -280,13 +282,41 @@ def test_the_condition_of_a_shorter_tick_fails_on_it(tmp_path: Path) -> None:
     # b >= K/(2 rate) + B' took this coupling for one that needs 1.7 of 2 N s/m
     device = OwnDevice(HANDS[2], every=8, rate=125.0)
     usual = default_method().requested_coupling(Coupling(300.0, 0.5, 0.3, 5e-4), T)
-    summary = run(device, usual, tmp_path / "slow.mcap")
+    summary = run(device, usual, tmp_path / "slow.mcap", rate=1000.0)
     assert device.gained > 0.1
     assert summary.is_certified is False
     report = audit(tmp_path / "slow.mcap")
     assert report.certified is False
     assert "device damping 2 < 7.13846 N s/m with one sample in 8 ticks" in report.conditions[0]
     assert "device damping 2 < 7.13846 N s/m with one sample in 8 ticks" in summary.conditions[0]
+
+
+@pytest.mark.parametrize("rate", [500.0, 250.0, 125.0])
+def test_a_loop_at_the_rate_of_a_slow_device_is_stiffer_and_gives_no_energy(
+    rate: float, tmp_path: Path
+) -> None:
+    path, edge = tmp_path / "own.mcap", (0.1 * (math.pi * rate) ** 2, 0.05)  # swings at rate/2
+    for hand, scene in itertools.product(HANDS, ("virtual_wall", "point_mass")):
+        device = OwnDevice(hand, rate=rate)
+        summary = run(device, None, scene=scene)
+        assert summary.is_certified is True
+        assert device.gained < 1e-6
+        law = summary.coupling.law
+        assert law is not None
+        assert law.stiffness == pytest.approx(1.2 * 2.0 * rate)
+        assert law.stiffness > 1.4 * default_coupling(device.info, T).stiffness
+    for share in (1.0, 1.25):  # of the largest stiffness, a spring alone
+        law = Coupling(share * 2.0 * 2.0 * rate, 0.0, 0.3, 5e-4)
+        device = OwnDevice(edge, rate=rate)
+        stiff = default_method().requested_coupling(law, 1 / rate)
+        summary = run(device, stiff, controller="off", limits=Limits(energy=math.inf))
+        assert summary.is_certified is (share == 1.0)
+        assert (device.gained > 5e-4, device.gained < 1e-6) == (share > 1.0, share == 1.0)
+    run(OwnDevice(HANDS[1], rate=rate), None, path)
+    report, (before, again, *_) = audit(path), what_if(path, {}, in_process=True).runs
+    assert (report.verdict, report.certified) == ("passive", True)
+    assert before.ticks["deadline_ns"][-1] == 2e9
+    assert again.ticks["wrench_on_device"].tolist() == before.ticks["wrench_on_device"].tolist()
 
 
 @pytest.mark.parametrize("late", [0.25, 1.0, 1.5, 3.0, 8.0])
