@@ -164,6 +164,7 @@ class OwnDevice:
     Args:
         hand: Stiffness in N/m and damping in N s/m of the hand.
         every: Ticks per sample; in the others the device holds its force.
+        is_new: True for the number of a tick with a sample, in place of ``every``.
         late: Ticks from a sample to its force, by the sample's number; a part of one, too.
         mass: Of hand and handle in kg.
         step: Of its encoder in m; 0 reads exactly.
@@ -176,6 +177,7 @@ class OwnDevice:
         hand: tuple[float, float],
         *,
         every: int = 1,
+        is_new: Callable[[int], bool] | None = None,
         late: Callable[[int], float] = lambda _: 0.0,
         mass: float = 0.1,
         step: float = 0.0,
@@ -190,7 +192,8 @@ class OwnDevice:
             "delay": 0.0,
         }
         self.info = DeviceInfo(**usual | {"force_limit": 10.0, "is_real": False} | sheet)
-        self.every, self.late, self.mass, self._begin = every, late, mass, start
+        self._is_new = is_new or (lambda tick: tick % every == 0)
+        self.late, self.mass, self._begin = late, mass, start
         self.stiffness, self.damping = hand
         self.step, self.got, self.gained = step, 0.0, 0.0
 
@@ -240,14 +243,14 @@ class OwnDevice:
         self._move(round(self._ticks - now, 9))
         self.got = self._stored() + self._burned - self._start
         self.gained = max(self.gained, self.got)
-        is_new = self._ticks % self.every == 0
+        is_new = self._is_new(self._ticks)
         if is_new:
             self._sample["position"][0, 0] = self._place()
         sample[:] = self._sample
         return 0 if is_new else int(TickFlag.STALE_SAMPLE)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        if self._ticks % self.every == 0:
+        if self._is_new(self._ticks):
             self._forces.append((self._ticks + self.late(self._ticks), float(wrench[0])))
             self._forces.sort(key=lambda each: each[0])
 
@@ -317,6 +320,60 @@ def test_a_loop_at_the_rate_of_a_slow_device_is_stiffer_and_gives_no_energy(
     assert (report.verdict, report.certified) == ("passive", True)
     assert before.ticks["deadline_ns"][-1] == 2e9
     assert again.ticks["wrench_on_device"].tolist() == before.ticks["wrench_on_device"].tolist()
+
+
+def deliveries(rng: np.random.Generator) -> Callable[[int], bool]:
+    """Returns a device's ticks with a sample: some lost, at another rate, in lumps, or with gaps."""
+    share, count, gap = rng.uniform(0.6, 0.995), int(rng.integers(2, 9)), int(rng.integers(20, 200))
+    has_come = np.random.default_rng(int(rng.integers(1000))).random(2001) < share
+    kinds: list[Callable[[int], bool]] = [
+        lambda tick: bool(has_come[tick]),
+        lambda tick: int(tick * share) > int((tick - 1) * share),
+        lambda tick: tick % (2 * count) < count,
+        lambda tick: tick % gap >= count,
+    ]
+    return kinds[int(rng.integers(4))]
+
+
+def test_a_device_that_delivers_otherwise_than_it_states_gives_no_energy_where_certified() -> None:
+    rng, certified, told = np.random.default_rng(3), [], 0
+    for scene, rate in itertools.product(
+        ("virtual_wall", "point_mass"), (1000.0, 500.0, 125.0) * 6
+    ):
+        device = OwnDevice(
+            (10 ** rng.uniform(2.3, 5.3), 10 ** rng.uniform(-1.5, 0.3)),
+            is_new=deliveries(rng),
+            mass=10 ** rng.uniform(-1.3, 0.3),
+            start=(rng.uniform(0, 5e-3), rng.uniform(0, 0.5)),
+            rate=rate,
+        )
+        summary = run(device, None, scene=scene)
+        certified.append(summary.is_certified)
+        told += f" of the {rate:g} new samples per second that the device states" in str(summary)
+        assert summary.is_certified is not True or device.gained < 1e-6
+    assert 3 < certified.count(True) < 33
+    assert told == 36
+
+
+@pytest.mark.parametrize("stated", [None, 500.0, 1000.0])
+@pytest.mark.parametrize("share", [1.0, 0.97, 0.612])
+def test_a_device_that_delivers_less_than_it_states_hears_it_once(
+    stated: float | None, share: float, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    device = OwnDevice(
+        HANDS[1], is_new=lambda tick: int(tick * share) > int((tick - 1) * share), rate=stated
+    )
+    law = default_method().requested_coupling(Coupling(150.0, 0.1, 0.3, 5e-4), 1 / (stated or 1e3))
+    summary, rate = run(device, law, path), stated or 1000.0
+    found = f"{share * rate:g} of the {rate:g} new samples per second that the "
+    found += "device states" if stated else "loop reads"
+    remedy = f"(--rate {share * rate:g}, or rate={share * rate:g} in its data sheet, suits it)"
+    report = audit(path)
+    assert report.timekeeping is not None
+    assert summary.is_certified is report.certified is True
+    for text in (str(summary), report.timekeeping.remark):
+        assert text.count(found) == text.count(remedy) == (share < 1.0)
 
 
 @pytest.mark.parametrize("late", [0.25, 1.0, 1.5, 3.0, 8.0])

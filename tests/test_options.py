@@ -135,6 +135,7 @@ def test_keywords_of_a_bridge_are_the_fields_of_its_options() -> None:
         ({"rate": 999.4, "delay": 0.0}, {}, 999.4),
         ({"rate": 500.0, "delay": 2.1e-3}, {}, 500.0),
         ({"rate": 0.5, "delay": 0.0}, {}, 1.0),
+        ({"rate": 999.9999999999991, "delay": 0.0}, {}, 1000.0),
         ({"rate": 4000.0, "delay": 0.0}, {}, 1000.0),
         ({"rate": 125.0, "delay": None}, {}, 1000.0),  # its samples may be a period old
         ({"rate": 125.0, "delay": 0.0, "is_prescribed": True}, {}, 1000.0),

@@ -210,7 +210,9 @@ def certification_of(
     A run that was not as the conditions assume certifies no device that meets them.
     """
     conditions = run_conditions(info, parameters, method)
-    kept = Timekeeping.from_times(times, parameters, conditions if method.has_law else ())
+    kept = Timekeeping.from_times(
+        times, parameters, conditions if method.has_law else (), info.rate
+    )
     verdict = is_run_certified(conditions, method)
     if info.is_prescribed:
         standing = Standing.NO_HAND

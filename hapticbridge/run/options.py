@@ -50,6 +50,7 @@ from hapticbridge.errors import (
 from hapticbridge.kernel.parameters import (
     MAX_BUTTONS,
     MAX_SCENE_TICKS,
+    ROUNDING,
     SAME_AXES,
     SUBSTEPS,
     UNGUARDED,
@@ -233,7 +234,8 @@ class BridgeOptions:
             if info.rate and info.delay is not None and not info.is_prescribed
         ]
         if is_open and self.rendering_method.has_law and len(stated) == len(infos):
-            rate = min(rate, max(LOWEST_RATE, *stated))
+            own = max(LOWEST_RATE, *stated)
+            rate = own if own < rate * (1.0 - ROUNDING) else rate
         return replace(self, rate=rate)
 
     @property
