@@ -323,7 +323,7 @@ def test_a_loop_at_the_rate_of_a_slow_device_is_stiffer_and_gives_no_energy(
 
 
 def deliveries(rng: np.random.Generator) -> Callable[[int], bool]:
-    """Returns a device's ticks with a sample: some lost, at another rate, in lumps, or with gaps."""
+    """Returns the ticks with a sample: some lost, at another rate, in lumps, or with gaps."""
     share, count, gap = rng.uniform(0.6, 0.995), int(rng.integers(2, 9)), int(rng.integers(20, 200))
     has_come = np.random.default_rng(int(rng.integers(1000))).random(2001) < share
     kinds: list[Callable[[int], bool]] = [
