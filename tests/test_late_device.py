@@ -27,7 +27,7 @@ from hapticbridge.demand.certificate import conditions_of, default_coupling
 from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.loop_setting import LoopSetting
 from hapticbridge.demand.methods import default_method
-from hapticbridge.device import DeviceInfo, Hand, Motion, SimulatedDevice
+from hapticbridge.device import DeviceInfo, Hand, Motion, SimulatedDevice, open_device
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
@@ -478,3 +478,53 @@ def test_energy_beyond_what_steps_hide_ends_the_run() -> None:
     with pytest.raises(SafetyTrip, match="the hand would get more"):
         metered(device, 20_000.0, controller="off")
     assert device.gained < 0.1
+
+
+def gathered(delay: int, ratio: float, b: float, friction: float) -> float:
+    """Returns the most energy per tick that a hand can gather at a wall, by dynamic programming.
+
+    In units with K = Δ = T = 1 and B' as ``ratio``. All motions are tried from tick to tick, on
+    places a quarter of a step apart. A state is a place and the readings that the held force needs.
+    """
+    places = (np.arange(-8, 8) + 0.5) / 4.0
+    count = 5  # readings -2 to 2
+    state = np.indices((len(places), *[count] * (delay + 1)))
+    place, read = places[state[0]], np.round(places).astype(int)[state[0]] + 2
+    readings = [read, *state[1:]]  # the newest first
+    force = readings[delay] - 2 + ratio * (readings[delay] - readings[delay + 1])
+    most, after = np.zeros(place.shape), []
+    for _ in range(120):
+        found = np.full(place.shape, -np.inf)
+        for i, target in enumerate(places):
+            way = target - place
+            gain = -force * way - b * way**2 - friction * np.abs(way)
+            found = np.maximum(found, gain + most[(i, *readings[: delay + 1])])
+        most = found
+        after.append(float(most.max()))
+    return (after[-1] - after[59]) / 60
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2])
+def test_no_motion_gathers_energy_from_steps_that_friction_holds(delay: int) -> None:
+    for ratio in (0.3, 1.0):
+        b = float(late_minimum_damping(1.0, ratio, 1.0, float(delay)))
+        assert gathered(delay, ratio, b, 0.5 + ratio) < 1e-9
+    assert gathered(delay, 1.0, b, 0.5 * 1.5) > 0.01
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_a_late_device_with_steps_is_certified_by_friction(delay: int) -> None:
+    text = f"simulated:delay={delay},stated_delay={delay * T},resolution={STEP}"
+    stated = open_device(f"{text},friction=0.1")
+    law = default_coupling(stated.info, T)
+    for spec, certified, words in (
+        ("friction=0.1", True, " >= "),
+        ("friction=0.01", False, "friction 10 mN < "),
+        ("friction=0.01,stated_friction=0.1", True, "friction 100 mN >= "),
+        ("friction=0.1,stated_friction=unknown", True, "its friction is unknown"),
+    ):
+        device = open_device(f"{text},{spec}")
+        with Bridge("virtual_wall", device, law, clock=SimulatedClock()) as bridge:
+            summary = bridge.run(0.2)
+        assert summary.is_certified is certified
+        assert words in summary.conditions[0]

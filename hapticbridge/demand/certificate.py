@@ -128,15 +128,16 @@ class StepCondition:
     """The condition f_c >= s (K Δ/2 + B' Δ/T) on a device that reports its position in steps.
 
     Without that friction the encoder's steps keep a hand swinging, and give it energy that no meter
-    of positions sees. It is known for a wall; s = scale · force_scale.
+    of positions sees. s = scale · force_scale. It is sufficient at a wall, at any delay and for any
+    number of ticks per sample: the law is linear, so an error of Δ/2 in each position changes the
+    force by at most s (K Δ/2 + B' Δ/T) at any time, and friction burns that times the way. Behind a
+    tool that moves by itself, steps may give up to ``HandEnergy.hidden`` more.
 
     Attributes:
         needed: Right-hand side in N; None if the step Δ is unknown.
         available: Coulomb friction f_c in N; None if unknown.
         resolution: Step Δ of the position in m; None if unknown.
         remedy: Changes with which it holds with 15 % in reserve; empty if it holds.
-        is_late: True for a device that answers late, or gives a sample in some ticks only. Its
-            steps are not judged, because the condition is not derived for it.
 
     References:
         Abbott & Okamura 2005.
@@ -146,7 +147,6 @@ class StepCondition:
     available: float | None
     resolution: float | None
     remedy: str = ""
-    is_late: bool = False
 
     @classmethod
     def of(cls, loop: LoopSetting) -> StepCondition | None:
@@ -159,12 +159,12 @@ class StepCondition:
             return cls(None, info.friction, None)
         needed = loop.ratio("translation") * step
         needed *= 0.5 * law.stiffness + law.damping / loop.period
-        return cls(needed, info.friction, step, is_late=loop.lag != IN_TIME)
+        return cls(needed, info.friction, step)
 
     @property
     def holds(self) -> bool | None:
         """True if friction holds the steps; None if it is unknown."""
-        if self.needed is None or self.available is None or self.is_late:
+        if self.needed is None or self.available is None:
             return None
         return self.available >= self.needed
 
@@ -190,8 +190,6 @@ class StepCondition:
                 f"its {steps} are not judged: its friction is unknown ('hapticbridge identify' "
                 f"measures it), {format_si(self.needed or 0.0, 'N')} needed"
             )
-        if self.is_late:
-            return f"its {steps} are not judged: it is late, or slower than the loop"
         relation = ">=" if self.holds else "<"
         text = (
             f"friction {format_si(self.available, 'N')} {relation} "
