@@ -528,3 +528,28 @@ def test_a_late_device_with_steps_is_certified_by_friction(delay: int) -> None:
             summary = bridge.run(0.2)
         assert summary.is_certified is certified
         assert words in summary.conditions[0]
+
+
+@pytest.mark.parametrize("late", [0.75, 1.0])
+def test_a_stated_delay_that_nobody_measured_may_be_a_tick_more(late: float) -> None:
+    hand, found = (48_100.0, 0.343), []
+    usual = default_coupling(replace(OwnDevice(hand).info, is_delay_measured=True), T)
+    for coupling in (None, usual):
+        device = OwnDevice(hand, late=lambda _: late, mass=0.057)
+        summary = run(device, coupling)
+        found.append((device.gained, summary.certification.words))
+    (chosen, words), (given, other) = found
+    assert chosen < 1e-6
+    assert "b >= KT/2 + B_law, if its forces come equally late, by at most 1 ms" in words
+    # this one bears no delay, and says so
+    assert given > 0.3
+    assert ", if its forces come at once" in other
+
+
+def test_a_measured_delay_is_taken_as_it_is() -> None:
+    stated = OwnDevice((1.0, 0.0)).info
+    measured = replace(stated, is_delay_measured=True)
+    assert default_coupling(measured, T).stiffness > 1.5 * default_coupling(stated, T).stiffness
+    # a slow loop waits for no message longer than a fast one
+    slow = default_coupling(stated, 8 * T).stiffness
+    assert slow > 0.8 * default_coupling(measured, 8 * T).stiffness

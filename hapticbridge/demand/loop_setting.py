@@ -74,7 +74,24 @@ class Lag:
 
 
 IN_TIME = Lag()
-"""A device that gives a sample in each tick and answers it within the tick."""
+"""A device that gives a sample in each tick and answers it at once."""
+
+
+UNCONFIRMED = 1e-3
+"""Time in s by which a delay may exceed what a device states: one message of USB, or a tick of the
+usual rate. A larger value makes couplings of devices softer whose delay nobody measured."""
+
+
+def guarded_lag(info: DeviceInfo, period: float) -> Lag:
+    """Returns the lag for which a coupling is chosen, with T in s.
+
+    A delay that the device states and no measurement confirms counts as one tick more, at most
+    ``UNCONFIRMED``: links and services take a time that no data sheet has.
+    """
+    lag = Lag.of(info, period)
+    if info.delay is None or info.is_delay_measured or info.is_prescribed:
+        return lag
+    return replace(lag, delay=lag.delay + min(period, UNCONFIRMED))
 
 
 # Device damping required by a coupling
@@ -228,9 +245,10 @@ class LoopSetting:
         is_linear = axis == "translation"
         return self.scale * self.force_scale if is_linear else self.force_scale / self.scale
 
-    def needed(self, axis: Axis) -> float:
-        """Returns the damping that the device needs in N s/m or N m s/rad."""
-        needed = required_damping(self.law, self.period, self.law_evaluations, axis, self.lag)
+    def needed(self, axis: Axis, lag: Lag | None = None) -> float:
+        """Returns the damping that the device needs in N s/m or N m s/rad; None takes its lag."""
+        lag = self.lag if lag is None else lag
+        needed = required_damping(self.law, self.period, self.law_evaluations, axis, lag)
         return self.ratio(axis) * needed
 
     def needs(self) -> tuple[float, float]:
