@@ -1,7 +1,7 @@
 """Energy that the times of samples and forces may have given to the hand, sample by sample.
 
 The condition b >= N assumes that samples come each T and that each force acts a constant time after
-its sample: the stated delay of the device t_d in whole ticks, 0 for one that answers within one. In
+its sample: the stated delay of the device t_d in whole ticks, 0 for one that answers at once. In
 a run, samples come late or not at all, and a force is sent some time after its sample. So each run
 keeps the account by which the condition is proved, at the times that it had:
 
