@@ -409,7 +409,7 @@ with more threads, OpenBLAS spins 0.1 s after every matrix exponential and the m
 twice as long."""
 
 Workers = int | Executor | str | None
-"""What computes a sweep: a number of processes, an executor, or the address of a scheduler."""
+"""Workers of a sweep: a number of processes, an executor, or the address of a scheduler."""
 
 _Finished = Generator[tuple[list[Point], list[Outcome]], None, None]
 

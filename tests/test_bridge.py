@@ -208,8 +208,7 @@ def test_second_run_raises_the_force_from_zero_again_and_is_simulated_again(tmp_
     path = tmp_path / "run.mcap"
     # it moves also between the runs, where no force acts and so no work is done
     device = ScriptedDevice(
-        lambda k: (0.00125 * np.clip(k - 10, 0, 10) + 5e-5 * np.sin(0.5 * k), 0, 0, 1, 0, 0, 0),
-        is_delay_measured=True,
+        lambda k: (0.00125 * np.clip(k - 10, 0, 10) + 5e-5 * np.sin(0.5 * k), 0, 0, 1, 0, 0, 0)
     )
     limits = Limits(force=10.0, torque=0.5, ramp=0.1)
     with fast("virtual_wall", device, recording=path, limits=limits) as bridge:

@@ -79,7 +79,7 @@ IN_TIME = Lag()
 
 UNCONFIRMED = 1e-3
 """Time in s by which a delay may exceed what a device states: one message of USB, or a tick of the
-usual rate. A larger value makes couplings of devices softer whose delay nobody measured."""
+usual rate. A larger value makes the couplings of unmeasured devices softer."""
 
 
 def guarded_lag(info: DeviceInfo, period: float) -> Lag:
