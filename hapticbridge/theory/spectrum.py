@@ -93,7 +93,8 @@ def needed_behind_delay(
         psi = (theta + 2.0 * np.pi * i) / count
         needed = needed_for_any_environment(transfer(psi), period, psi)
         total = total + needed / np.sin(0.5 * psi) ** 2
-    return lag * total
+    needed_late: NDArray[np.float64] = lag * total
+    return needed_late
 
 
 def damping_spectrum(

@@ -29,7 +29,6 @@ from hapticbridge.theory.bounds import (
 )
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand, stability_limit
 from hapticbridge.theory.spectrum import (
-    Transfer,
     damping_spectrum,
     damping_spectrum_of,
     needed_for_fixed_environment,
@@ -153,7 +152,8 @@ def any_coupling() -> Section:
             Check(
                 quantity="spring and damper, the device one tick late, for every environment",
                 route="frequency sweep, against T y³/(2 (y² − K²)), y = K + 2B/T",
-                expected=PERIOD * (K + 2 * B / PERIOD) ** 3
+                expected=PERIOD
+                * (K + 2 * B / PERIOD) ** 3
                 / (2 * ((K + 2 * B / PERIOD) ** 2 - K**2)),
                 got=float(np.max(late)),
                 unit="N s/m",
