@@ -15,8 +15,8 @@ from hapticbridge.device.base import DeviceInfo
 from hapticbridge.errors import CouplingError
 from hapticbridge.kernel.ledger import SLACK_SHARE
 from hapticbridge.kernel.parameters import ROUNDING, RunParameters, checked_substeps, whole_ticks
-from hapticbridge.theory.bounds import late_minimum_damping, minimum_damping
-from hapticbridge.theory.transfer import delayed_by
+from hapticbridge.theory.bounds import minimum_damping
+from hapticbridge.theory.transfer import CouplingGrid, delayed_by
 
 Axis = Literal["translation", "rotation"]
 
@@ -114,7 +114,7 @@ def required_damping(
 
     K and B are those of the law (``Method.law_coupling``), not the effective ones. With one
     evaluation of the law per tick b = K T/2 + B, and more behind a device that is late
-    (``theory.bounds.late_minimum_damping``). With m evaluations of the law per tick the handle
+    (``theory.bounds.minimum_damping``). With m evaluations of the law per tick the handle
     moves by an m-th of its step for each, and the mean wrench is sent. There is no closed form; b
     is the smallest value for which
 
@@ -149,12 +149,11 @@ def required_damping(
     k = coupling.stiffness if is_linear else coupling.rotational_stiffness
     damping = coupling.damping if is_linear else coupling.rotational_damping
     if checked_substeps(law_evaluations, CouplingError) == 1:
-        if lag == IN_TIME:
-            return float(minimum_damping(coupling, period, axis=axis))
         if k == 0.0:
             return lag.ticks_per_sample * damping
-        late = late_minimum_damping(k, damping, period, lag.delay, lag.ticks_per_sample)
-        return float(late)
+        law, ticks = CouplingGrid(k, damping), lag.delay / period
+        n = lag.ticks_per_sample
+        return float(minimum_damping(law, period, delay=ticks, ticks_per_sample=n))
     count, held = law_evaluations * lag.ticks_per_sample, lag.ticks_per_sample * period
     b = damping * law_evaluations / period
     if k == 0.0:

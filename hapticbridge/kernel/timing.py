@@ -30,7 +30,7 @@ what wrenches on their way will cost, motion has paid for before.
 No property of the law is assumed: force level, slip, lever, changed gains, contacts, several hands
 and slower scenes are all in W_c and V. From any sample on, the hand gets at most A + C + q V, and
 what the scene had or created. In a strict scene with b >= N and constant times, A stays near 0; see
-``theory.bounds.late_minimum_damping``. What a scene within its slack created is added to A for a
+``theory.bounds.minimum_damping``. What a scene within its slack created is added to A for a
 device that answers late: only the condition of a device in time pays for it.
 
 References:
