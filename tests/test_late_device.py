@@ -604,7 +604,7 @@ def gathered(delay: int, ratio: float, b: float, friction: float) -> float:
 @pytest.mark.parametrize("delay", [0, 1, 2])
 def test_no_motion_gathers_energy_from_steps_that_friction_holds(delay: int) -> None:
     for ratio in (0.3, 1.0):
-        b = float(late_minimum_damping(1.0, ratio, 1.0, float(delay)))
+        b = minimum_damping(Coupling(1.0, ratio, 0.0, 0.0), 1.0, delay=delay)
         assert gathered(delay, ratio, b, 0.5 + ratio) < 1e-9
     assert gathered(delay, 1.0, b, 0.5 * 1.5) > 0.01
 
