@@ -146,7 +146,7 @@ def print_result(
         return
     out.print(
         f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness "
-        f"{'of a wall ' if z.delay else ''}is {z.limit[0]:.4g} N/m at B_law = 0 "
+        f"is {z.limit[0]:.4g} N/m at B_law = 0 "
         f"({z.corner_limited_by}){_with_more_damping(z)}{_if_in_time(info, z.period)}"
     )
     out.print(f"use {coupling.sentences()[0]}")
@@ -174,7 +174,7 @@ def _if_in_time(info: DeviceInfo, period: float) -> str:
 def _with_more_damping(z: ZWidth) -> str:
     """Returns the largest safe stiffness where the coupling's damper raises it; or nothing.
 
-    Behind a delay the damper lowers what a wall asks of the device.
+    Behind a delay the damper lowers what is needed at low frequencies.
     """
     at = int(np.argmax(z.limit))
     if z.limit[at] < 1.01 * z.limit[0]:

@@ -224,14 +224,15 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
         table.add_row(line.name, stiffness, f"{line.largest_damping:.4g} N s/m", reason)
     out.print(table)
     reasons = {line.name: line.reason for line in z.lines}
-    reason = reasons.get(z.corner_limited_by, f"in every scene, {NEEDED_SHARE:.0%} of b needed")
-    out.print(f"limited by: {z.corner_limited_by} ({reason})")
+    out.print(f"limited by: {z.corner_limited_by} ({reasons[z.corner_limited_by]})")
     for note in z.notes:
         out.print(f"note: {note}")
     (sentence,) = recommended_coupling(z).sentences()
     at, safe = z.corner.damping, z.corner.stiffness / STIFFNESS_MARGIN
     of = f": 80 % of the {safe:.4g} N/m that are safe at B_law = {at:.3g} N s/m"
-    out.print(f"use {sentence}{'' if z.delay else of}")
+    if z.delay:
+        of = f": it needs at most {NEEDED_SHARE:.0%} of b, in every scene"
+    out.print(f"use {sentence}{of}")
     if command is None:
         out.print(
             "'hapticbridge run' has no low-pass: leave --filter-time out for a run's coupling"
@@ -405,8 +406,8 @@ class Bound:
         least = method.compensated_share * self.stiffness * period
         if self.device is None:
             out.print(
-                "a delay of the device is not in it: --device counts it, for every scene, and "
-                "'zwidth --delay' has the couplings that it allows"
+                "a delay of the device is not in it: --device counts it, and 'zwidth --delay' has "
+                "the couplings that it allows"
             )
         if self.damping < least:
             out.print(

@@ -166,7 +166,8 @@ class Certification:
     @property
     def _if(self) -> str:
         """Clause on a delay that no measurement confirms."""
-        return next(filter(None, (each.clause for each in self.conditions)), "")
+        timed = [each for each in self.conditions if each.unconfirmed_delay is not None]
+        return min(timed, key=lambda each: each.unconfirmed_delay or 0.0).clause if timed else ""
 
     @property
     def fact(self) -> str:

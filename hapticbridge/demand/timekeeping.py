@@ -8,7 +8,7 @@ once. A run certifies its device only if it kept its time, which means two thing
 
        b >= N (1/s + j/T) + N(t_d + t_w) − N(t_d)
 
-   N(t) is what a delay t needs (``theory.bounds.late_minimum_damping``), N = N(t_d). s is the
+   N(t) is what a delay t needs (``theory.bounds.minimum_damping``), N = N(t_d). s is the
    smaller of two shares: deadlines that were kept, and samples that were new. In ticks without a
    new sample the tool moves, so that these ask for m (m − 1) (K T)²/(4 N) more, with one new sample
    in m ticks on average. j is the mean time by which a sample came later after its deadline than
@@ -35,8 +35,8 @@ from hapticbridge.kernel.hand_energy import INSTANT
 from hapticbridge.kernel.parameters import ROUNDING, RunParameters
 from hapticbridge.kernel.record import TickFlag
 from hapticbridge.kernel.swing_watch import PUSH, STAND
-from hapticbridge.theory.bounds import late_minimum_damping
-from hapticbridge.theory.transfer import MAX_DELAY
+from hapticbridge.theory.bounds import minimum_damping
+from hapticbridge.theory.transfer import MAX_DELAY, CouplingGrid
 from hapticbridge.units import format_si
 
 NOT_KEPT = "the run did not keep its time"
@@ -418,11 +418,16 @@ def _at_times(
         # samples that did not come: the tool moved in the ticks between them
         count = max(times.ticks / times.new_samples, ticks) if times.new_samples else math.inf
         needed += ratio * kappa * period * count * (count - ticks)
+        law = CouplingGrid(k, b)
+
+        def at(delay: float) -> float:
+            late = delay / period
+            if late > MAX_DELAY * ticks:  # beyond what the theory takes
+                return math.inf
+            return float(minimum_damping(law, period, delay=late, ticks_per_sample=ticks))
+
         delay = condition.delay or 0.0
-        whole = math.inf  # beyond what the theory takes
-        if delay + times.mean_delay <= MAX_DELAY * ticks * period:
-            whole = float(late_minimum_damping(k, b, period, delay + times.mean_delay, ticks))
-        needed += ratio * (whole - float(late_minimum_damping(k, b, period, delay, ticks)))
+        needed += ratio * (at(delay + times.mean_delay) - at(delay))
     at_times = replace(condition, needed=needed)
     if at_times.holds is False and condition.holds is not False:
         return replace(at_times, remedy=remedy)

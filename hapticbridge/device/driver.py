@@ -15,7 +15,7 @@ Notify = Callable[[str], None]
 """Receives a message for the user while a device is opened or started: an instruction or
 progress."""
 
-Options = Mapping[str, type[Any]]
+Options = Mapping[str, Callable[[str], Any]]
 """Options of a device by name, with the type of each value: ``float``, ``int``, ``str`` for text
 up to the next comma (a serial number may have leading zeros), ``Path`` for all remaining text."""
 

@@ -206,8 +206,20 @@ def refuse_unknown(device: str, options: Iterable[str], valid: Iterable[str]) ->
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _HAND_PREFIX = "hand_"
 _HAND_OPTIONS = tuple(_HAND_PREFIX + name for name in inspect.signature(Hand).parameters)
+_STATED_PREFIX = "stated_"
+_STATED_OPTIONS = tuple(
+    _STATED_PREFIX + name for name in ("damping", "delay", "friction", "resolution")
+)
+
+
+def _stated(text: str) -> float | None:
+    """Returns a value of a data sheet; None for ``unknown``."""
+    return None if text == "unknown" else float(text)
+
+
 _SIMULATED_OPTIONS: Options = {
     **dict.fromkeys((*inspect.signature(SimulatedDevice).parameters, *_HAND_OPTIONS), float),
+    **dict.fromkeys(_STATED_OPTIONS, _stated),
     "delay": int,
     "dof": int,
     "hand": str,
@@ -224,8 +236,9 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
     - ``simulated``, ``simulated:damping=5,friction=0.1``: a ``SimulatedDevice`` with these
       parameters, numbers in SI units. ``hand_mass``, ``hand_damping``, ``hand_stiffness``,
       ``hand_rotational_inertia``, ``hand_rotational_damping`` and ``hand_rotational_stiffness``
-      change its hand, ``hand=none`` removes it. ``path=FILE`` must be last: all text after it is
-      the file's name.
+      change its hand, ``hand=none`` removes it. ``stated_damping``, ``stated_delay`` in s,
+      ``stated_friction`` and ``stated_resolution`` are what its data sheet says, or ``unknown``, in
+      place of the truth. ``path=FILE`` must be last: all text after it is the file's name.
     - ``trajectory:FILE``: follows a CSV file (``read_motion``) or repeats the device motion of a
       recording. All text after the colon is the file's name, with commas and colons.
     - ``mouse``: a handle that is dragged in the view, ``mouse:speed=0.5``.
@@ -337,6 +350,11 @@ def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:
     requested = parsed("simulated", rest, _SIMULATED_OPTIONS)
     parameters: dict[str, Any] = {**options, **requested}
     changes = {name: parameters.pop(name) for name in _HAND_OPTIONS if name in parameters}
+    stated: dict[str, Any] = {
+        name.removeprefix(_STATED_PREFIX): parameters.pop(name)
+        for name in _STATED_OPTIONS
+        if name in parameters
+    }
     if "hand" not in parameters:
         parameters["hand"] = Hand(
             **{name.removeprefix(_HAND_PREFIX): value for name, value in changes.items()}
@@ -349,7 +367,11 @@ def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:
         raise DeviceError(
             f"hand is {parameters['hand']!r}; it must be 'none'; {choices(_HAND_OPTIONS)} change it"
         )
-    return SimulatedDevice(**parameters)
+    device = SimulatedDevice(**parameters)
+    if "delay" in stated:
+        stated["is_delay_measured"] = False
+    device.info = replace(device.info, **stated)
+    return device
 
 
 def _open_trajectory(rest: str, options: Mapping[str, object]) -> Device:

@@ -223,7 +223,7 @@ class BridgeOptions:
         """Returns the options with the rate chosen, for the devices of all hands.
 
         A loop at the device's rate has one tick per sample, T_d, and K is up to 2 b/T_d. A faster
-        one has n, and K is up to b/(T_d √(n − 1)) (``theory.bounds.late_minimum_damping``). With a
+        one has n, and K is up to b/(T_d √(n − 1)) (``theory.bounds.minimum_damping``). With a
         delay it is less in both, and still more in the first.
         """
         rate = self.loop_rate

@@ -154,8 +154,8 @@ class SimulatedDevice:
         rotational_resolution: Step of the reported rotation vector's components in rad, >= 0.
         friction: Coulomb friction f_c per axis of translation in N, >= 0.
         dof: 6, or 3 for a device without rotation.
-        delay: Whole samples from a write until the motors act, 0 to 100. The data sheet calls it
-            unknown, so such a device is not certified.
+        delay: Whole samples from a write until the motors act, 0 to 100. The data sheet calls a
+            delay unknown, and then the device is not judged.
         force_limit: Force limit of the data sheet in N, >= 0.
         torque_limit: Torque limit of the data sheet in N m, >= 0.
         speed_limit: Speed limit of the data sheet in m/s, >= 0.
