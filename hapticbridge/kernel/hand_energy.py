@@ -49,8 +49,9 @@ class HandEnergy:
         net: Largest E − H − q R in J with R of ``passivity_controller.observe_release``; the
             guard's energy limit bounds it. E counts here with the least dissipation that the
             positions show.
-        hidden: H in J, the most that steps of the encoder may have hidden or added; 0 for exact
-            positions and for an unknown resolution (``passivity_controller.observe_energy``).
+        hidden: H in J, to which E is known behind steps of an encoder; 0 for exact positions and
+            for an unknown resolution (``passivity_controller.observe_energy``). ``net`` leaves H
+            out, so that the hand may have got 2 H more.
         unpaid: Largest unpaid energy in J.
         springs: q V_0 in J.
         scene: R, energy in J that the scene's storage has given to the hand.
@@ -107,7 +108,7 @@ class HandEnergy:
     @property
     def blur(self) -> str:
         """Energy that no meter of stepped positions sees, as a clause; empty without steps."""
-        return f"may hide {format_energy(self.hidden)} to the hand" if self.hidden else ""
+        return f"may hide {format_energy(2.0 * self.hidden)} to the hand" if self.hidden else ""
 
     @property
     def sentence(self) -> str:
