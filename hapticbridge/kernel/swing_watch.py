@@ -34,12 +34,12 @@ Findings, for translation and rotation each; E is 8 mJ at a limit of 10 N or 0.5
     ms without a stated delay, with E_s >= E for 40 ms; or c <= 0 and p < 0.6 with c_s >= 0.4 for 12
     ms. The greatest ratio r of the lever between device and handle is halved, hence the stiffness
     quartered; again for each E_s >= E.
-    slammed: in every tick, with w and v above 25 Hz and w_d the force of d earlier, b Σ v² − Σ w·v
-    is 6.4 mW or more on average over 0.3 s, at a limit of 10 N or 0.5 N m, and 70 % of that average
-    now, since a single blow is forgotten; and Σ w_d·v >= 0.9 b Σ v² for a d of 1, 2 or 3 ms, each
-    for 0.3 s. r is halved. No hand swings so fast, and a force that acts later explains the motion,
-    so it did. d begins at a stated delay, which also replaces w by its w_d if that gives more work.
-    Blows on a stop of the device lack energy, too, but no force explains them. Of an unknown
+    slammed: with w and v of every tick above 25 Hz, sums over 0.3 s, and w_d the force of d earlier,
+    b Σ v² − Σ w·v is 6.4 mW or more on average over 0.3 s, at a limit of 10 N or 0.5 N m, and 90 %
+    of that average now, since a single blow is forgotten; and Σ w_d·v >= 1.1 b Σ v² for a d of 1 or
+    2 ms, each for 0.25 s. r is halved. No hand swings so fast, and a force that acts later explains
+    the motion, so it did. d begins at a stated delay, whose w_d also replaces w if it gives more
+    work. Blows on a stop of the device lack energy, too, but no force explains them. Of an unknown
     damping b = 0 counts.
     coarse: 3 steps within 0.3 s. r is halved. A step is a new sample that follows equal ones of 4
     ms and more, and over which the coupling pulls with half the limit, r K ‖δp‖ >= F/2.
@@ -153,14 +153,16 @@ STEPS, STEP = 3.0, 0.5
 """Number of steps for a finding, and the least share of the limit that a step is worth; no unit. A
 lower share takes steps of 0.2 mm at 2400 N/m and a limit of 2 N, which can be felt, for a fault."""
 
-SLAM, GOES_ON, EXPLAINED = 0.8, 0.7, 0.9
-"""Least missing power of a slam in E per s, least share of its average that is missing now, and
-least share of b Σ v² from a later force. A lower ``SLAM`` finds smaller swings, and takes those of
-an encoder with steps of 0.2 mm for slams; lower shares take the ringing of stiff hands for them."""
+SLAM, GOES_ON, EXPLAINED, LASTS = 0.8, 0.9, 1.1, 0.25
+"""Least missing power of a slam in E per s, least share of its average that is missing now, least
+ratio of a later force's work to b Σ v², and time in s for which all hold. A lower ``SLAM`` takes
+swings of an encoder with steps of 0.2 mm for slams; lower shares and times take the ringing of
+stiff hands, or blows on a stop. All of these last for up to 0.19 s, and true swings go on."""
 
-SENT_LAGS, SWUNG = (0.0, 0.0, 0.001, 0.002, 0.003), 25.0
+SENT_LAGS, SWUNG = (0.0, 0.0, 0.001, 0.002), 25.0
 """Ages of forces in s, all but the first beyond a stated delay, and corner in Hz of their filter. A
-block hides swings of 100 to 170 Hz; a lower corner leaves more of a hand's blows."""
+block hides swings of 100 to 170 Hz. A lower corner leaves more of a hand's blows; with 3 ms, blows
+on a stop of the device are taken for slams."""
 
 ANSWERS, STRIDE = 6, 2
 """Number of lags of c_s, and blocks from one to the next: 8, 16 to 48 ms. A motor that holds for 60
@@ -239,6 +241,7 @@ WATCH_DTYPE = np.dtype(
         ("known_damping", "<f8", 2),
         ("missing_power", "<f8", 2),
         ("sent_lags", "<i8", len(SENT_LAGS)),
+        ("slam_blocks", "<i8"),
         ("swung_corner", "<f8"),
         ("swung_kept", "<f8"),
         ("swung_slow", "<f8", 24),
@@ -307,8 +310,9 @@ def bind_watch(watch: Part, parameters: RunParameters) -> None:
     stated = whole_ticks(limits.stated_delay, period)
     lags = [max(round(lag / period), lag > 0.0) + stated for lag in SENT_LAGS]
     watch["sent_lags"] = [0] + [min(lag, SENT - SPREAD) for lag in lags[1:]]
+    watch["slam_blocks"] = max(round(LASTS / block), 1)
     watch["swung_corner"] = 1.0 - math.exp(-2.0 * math.pi * SWUNG * period)
-    watch["swung_kept"] = math.exp(-period / FAST_MEMORY)
+    watch["swung_kept"] = math.exp(-period / WORK_MEMORY)
     watch["limits"] = parameters.force_limit, parameters.torque_limit
     level = parameters.force_limit / USUAL_FORCE, parameters.torque_limit / USUAL_TORQUE
     watch["late_energy"] = [limits.swing_energy * part for part in level]
@@ -641,16 +645,16 @@ def _is_slammed(watch: Part, kind: int) -> bool:
     """Adds a block to the missing power; returns True if a late force has long explained it."""
     work, at = watch.sent_power, len(SENT_LAGS) * kind
     burnt = watch.known_damping[kind] * watch.swung_square[kind]
-    power = (burnt - max(work[at], work[at + 1])) / FAST_MEMORY
+    power = (burnt - max(work[at], work[at + 1])) / WORK_MEMORY
     mean = watch.kept[1] * (watch.missing_power[kind] - power) + power
     watch.missing_power[kind] = mean
-    is_explained = max(work[at + 2], work[at + 3], work[at + 4]) >= EXPLAINED * burnt
+    is_explained = max(work[at + 2], work[at + 3]) >= EXPLAINED * burnt
     goes_on = power >= GOES_ON * mean  # not one blow that is being forgotten
     if mean >= SLAM * watch.late_energy[kind] * watch.cap and is_explained and goes_on:
         watch.counts[6 * kind + 5] += 1
     else:
         watch.counts[6 * kind + 5] = 0
-    return bool(watch.counts[6 * kind + 5] >= watch.ring_blocks and watch.cap > 0.0)
+    return bool(watch.counts[6 * kind + 5] >= watch.slam_blocks and watch.cap > 0.0)
 
 
 @compiled
