@@ -408,6 +408,9 @@ _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OMP_NUM_THR
 with more threads, OpenBLAS spins 0.1 s after every matrix exponential and the map ``contact`` takes
 twice as long."""
 
+Workers = int | Executor | str | None
+"""Workers of a sweep: a number of processes, an executor, or the address of a scheduler."""
+
 _Finished = Generator[tuple[list[Point], list[Outcome]], None, None]
 
 
@@ -417,9 +420,7 @@ def sweep(
     *,
     results: str | os.PathLike[str] | None = None,
     chunk: int | None = None,
-    executor: Executor | None = None,
-    scheduler: str | None = None,
-    jobs: int | None = None,
+    workers: Workers = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Table:
     """Applies a function to every point and returns a table of the results.
@@ -439,11 +440,10 @@ def sweep(
         results: File that keeps the results. Points that it holds, failed ones too, are not
             computed again. One sweep at a time may use a file.
         chunk: Points per task, >= 1; by default 1/32 of a core's share, at most 256.
-        executor: Any executor; it stays open. By default fresh processes, one per core, with
-            OPENBLAS_NUM_THREADS=1. Without it, short loops with a simulated device take twice as
-            long in an executor's processes.
-        scheduler: Address of a dask.distributed scheduler (extra ``cluster``) instead.
-        jobs: Largest number of processes, >= 1; 1 works in this process.
+        workers: Largest number of fresh processes, >= 1, by default one per core; 1 works in this
+            process. Or any executor, which stays open, or the address of a dask.distributed
+            scheduler (extra ``cluster``). The own processes have OPENBLAS_NUM_THREADS=1; without
+            it, short loops with a simulated device take twice as long.
         progress: Called with the numbers of finished and of all points, first before any task.
 
     Raises:
@@ -452,9 +452,8 @@ def sweep(
     """
     name = _name_of(function)
     wanted = checked_points(points)
-    if executor is not None and scheduler is not None:
-        raise StudyError("executor and scheduler were both given; give one of them")
-    for word, count in (("chunk", chunk), ("jobs", jobs)):
+    number = None if isinstance(workers, Executor | str) else workers
+    for word, count in (("chunk", chunk), ("workers", number)):
         if count is not None and (type(count) is not int or count < 1):
             raise StudyError(f"{word} is {count!r:.60}; it must be a whole number >= 1")
     kept = None if results is None else ResultFile(results, name)
@@ -470,7 +469,7 @@ def sweep(
         return table_of([wanted[key] for key in ready], [done[key] for key in ready])
 
     try:
-        with contextlib.closing(_computed(function, chunks, executor, scheduler, jobs)) as finished:
+        with contextlib.closing(_computed(function, chunks, workers)) as finished:
             for computed, outcomes in finished:
                 if kept is not None:
                     kept.add(computed, outcomes)
@@ -493,22 +492,21 @@ def cores() -> int:
 def _computed(
     function: Callable[[Any], Any],
     chunks: deque[list[Point]],
-    executor: Executor | None,
-    scheduler: str | None,
-    jobs: int | None,
+    workers: Workers,
 ) -> _Finished:
     """Yields chunks with their outcomes as they are finished; empties ``chunks``."""
-    if executor is None and scheduler is None and jobs == 1:
+    if workers == 1:
         while chunks:
             chunk = chunks.popleft()
             yield chunk, _outcomes(function, chunk)
-    elif executor is not None:
-        _refuse_lost((yield from _submitted(executor, function, chunks, _IN_FLIGHT)))
-    elif scheduler is not None:
-        with _cluster(scheduler) as (workers, count):
-            _refuse_lost((yield from _submitted(workers, function, chunks, 2 * count)))
+    elif isinstance(workers, Executor):
+        _refuse_lost((yield from _submitted(workers, function, chunks, _IN_FLIGHT)))
+    elif isinstance(workers, str):
+        with _cluster(workers) as (cluster, count):
+            _refuse_lost((yield from _submitted(cluster, function, chunks, 2 * count)))
     while chunks:
-        count = min(jobs or cores(), len(chunks))
+        # none are left where an executor took them
+        count = min(workers if isinstance(workers, int) else cores(), len(chunks))
         with _processes(function, count) as pool:
             # one task waits behind each that runs, so that no process idles
             lost = yield from _submitted(pool, function, chunks, 2 * count)

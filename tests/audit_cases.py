@@ -163,6 +163,7 @@ SHEET = DeviceInfo(
     torque_limit=0.5,
     speed_limit=5.0,
     delay=0.0,
+    is_delay_measured=True,
     is_real=False,
 )
 

@@ -19,7 +19,7 @@ def boundary_of(
     drawn = StabilityMap.from_module(module)
     few = replace(drawn, points=lambda n: [point for point in drawn.points(n) if keep(point)])
     with ThreadPoolExecutor(2) as executor:
-        files = run_map(few, folder, points=count, executor=executor)
+        files = run_map(few, folder, points=count, workers=executor)
     assert files.failed == 0
     assert files.picture.exists()
     return files.finding.boundary

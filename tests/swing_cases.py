@@ -165,7 +165,13 @@ class OnItsStop:
     """
 
     info = hb.DeviceInfo(
-        name="rail", axes=("x",), force_limit=10.0, damping=2.0, delay=0.0, is_real=False
+        name="rail",
+        axes=("x",),
+        force_limit=10.0,
+        damping=2.0,
+        delay=0.0,
+        is_delay_measured=True,
+        is_real=False,
     )
 
     def __init__(

@@ -97,7 +97,7 @@ def test_links_lead_to_files_and_in_no_circle(runs: Path, tmp_path: Path) -> Non
     # a folder that fits a pattern stands for what is in it
     names = [path.name for path in find_recordings([f"{tmp_path}/day*"])]
     assert names == ["C.MCAP", "b.mcap"]
-    table = audit_all(find_recordings([tmp_path]), jobs=1)
+    table = audit_all(find_recordings([tmp_path]), workers=1)
     assert table.texts("verdict")[0] == "unreadable"
     assert "gone.mcap: No such file" in table.texts("reason")[0]
 
@@ -129,7 +129,7 @@ def test_the_damping_margin_is_that_of_the_condition(runs: Path) -> None:
 
 
 def test_the_table_is_sorted_by_margin_and_hides_nothing(runs: Path) -> None:
-    table = audit_all(find_recordings([runs]), jobs=1)
+    table = audit_all(find_recordings([runs]), workers=1)
     names = [Path(file).name for file in table.texts("file")]
     assert names[:3] == ["foreign.mcap", "changed.mcap", "stiff.mcap"]
     assert sorted(names[3:]) == ["cut.mcap", "tap.mcap", "weak.mcap"]
@@ -154,7 +154,7 @@ def test_a_worker_that_fails_is_a_row_and_no_end(
         return audit(path, **options)
 
     monkeypatch.setattr(batch, "audit", broken)
-    table = audit_all([runs / "a" / "tap.mcap", runs / "stiff.mcap"], jobs=1)
+    table = audit_all([runs / "a" / "tap.mcap", runs / "stiff.mcap"], workers=1)
     assert list(table.texts("verdict")) == ["unreadable", "passive"]
     assert "too large" in table.texts("reason")[0]
     assert worst_exit_code(table) == 2

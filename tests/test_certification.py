@@ -22,7 +22,8 @@ from hapticbridge.demand.certification import Standing
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.profile import Profile, Quantity
 from hapticbridge.recording import read_recording
-from hapticbridge.theory.bounds import late_minimum_damping
+from hapticbridge.theory.bounds import minimum_damping
+from hapticbridge.theory.transfer import CouplingGrid
 
 WEAK = Coupling(5000.0, 0.5, 2.0, 1e-3)
 SHEETS: dict[Standing, tuple[dict[str, Any], Coupling | None, str]] = {
@@ -57,8 +58,13 @@ def test_run_and_audit_reach_one_verdict_with_one_reason(
 
 def test_a_late_device_that_has_the_damping_is_certified_for_its_delay(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    summary = recorded(path, "point_mass", ScriptedDevice(sway, delay=1.5e-3), duration=0.1)
-    words = "b >= what its delay needs, if its forces come equally late, by at most 2 ms"
+    summary = recorded(
+        path,
+        "point_mass",
+        ScriptedDevice(sway, delay=1.5e-3, is_delay_measured=False),
+        duration=0.1,
+    )
+    words = "b >= what its delay needs, if its forces come equally late, by at most 3 ms"
     for found in (summary.certification, audit(path).certification):
         assert found is not None
         assert found.standing is Standing.CERTIFIED
@@ -128,18 +134,18 @@ def test_the_most_demanding_coupling_of_a_run_counts_its_friction_too(tmp_path: 
 def test_the_search_of_a_late_devices_coupling_takes_little_memory() -> None:
     ratios = 1e-3 * np.linspace(0.0, 50.0, 400)
     tracemalloc.start()
-    needed = np.asarray(late_minimum_damping(1.0, ratios, 1e-3, 50e-3))
+    needed = np.asarray(minimum_damping(CouplingGrid(1.0, ratios), 1e-3, delay=50))
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert most < 10e6
-    alone = [late_minimum_damping(1.0, float(each), 1e-3, 50e-3) for each in ratios[::100]]
-    assert needed[::100].tolist() == alone
+    alone = [minimum_damping(CouplingGrid(1.0, r), 1e-3, delay=50) for r in ratios[::100]]
+    assert needed[::100] == pytest.approx(alone, rel=1e-12)
 
 
 def test_a_run_on_a_slow_device_says_what_its_own_rate_would_allow(
     call: Called, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    command, opened = "run point_mass --fast --duration 0.05", SimulatedDevice()
+    command, opened = "run point_mass --fast --duration 0.05 --rate 1000", SimulatedDevice()
     monkeypatch.setattr("hapticbridge.cli.run.device_for", lambda *_: opened)
     assert "new samples per second" not in call(*command.split())[2]
     opened = SimulatedDevice()
@@ -147,3 +153,7 @@ def test_a_run_on_a_slow_device_says_what_its_own_rate_would_allow(
     told = " ".join(call(*command.split())[2].split())
     assert "the device gives 250 new samples per second, and each force is held:" in told
     assert "--rate 250 would allow " in told
+    told = " ".join(call("run", "point_mass", "--fast", "--duration", 0.05)[2].split())
+    assert told.count("the loop runs at 250 Hz, as often as the device has a new sample") == 1
+    assert "point_mass on simulated, 250 Hz, method lossless" in told
+    assert "would allow" not in told

@@ -9,7 +9,8 @@ import pytest
 from cli_cases import Called, facts_of
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.theory.bounds import late_minimum_damping, stiffest_late_coupling
+from hapticbridge.theory.bounds import minimum_damping, stiffest_late_coupling
+from hapticbridge.theory.transfer import CouplingGrid
 
 ZWIDTH = "zwidth --damping 2 --mass 0.1 --friction 0.05 --resolution 1e-5 --rate 1000"
 FREE = "simulated:hand=none,resolution=1e-6"
@@ -96,9 +97,10 @@ def test_the_coupling_to_use_behind_a_delay_holds_for_every_scene(
     law = facts["corner"]["law"]
     best = stiffest_late_coupling(2.0, 1e-3, delay, 1)
     assert (law["stiffness"], law["damping"]) == pytest.approx(best)
-    needed = late_minimum_damping(law["stiffness"], law["damping"], 1e-3, delay)
+    grid = CouplingGrid(law["stiffness"], law["damping"])
+    needed = minimum_damping(grid, 1e-3, delay=delay / 1e-3)
     assert needed == pytest.approx(0.85 * 2.0)
-    assert facts["corner"]["limited_by"] == "passive for any hand behind the delay"
+    assert facts["corner"]["limited_by"] == "passive for any hand"
     # friction that does not hold the steps lowers both gains
     weak = "--friction", 0.005, "--resolution", 1e-5
     _, facts = facts_of(call, "zwidth", "--damping", 2, "--delay", delay, *weak)

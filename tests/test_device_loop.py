@@ -157,7 +157,7 @@ def test_the_peg_goes_in_behind_it_and_is_audited_passive(name: str, tmp_path: P
     seconds = 2.5 if name == "falcon" else 4.0  # emulated bit by bit, it is the slowest
     summary = rig.run(recording, seconds)
     report, ticks = hb.audit(recording), rows(recording)
-    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit"), report.reason
     is_proved = "its delay" in condition and not rig.device.info.sensed
     assert report.certified is (True if is_proved else None)
     assert condition in report.conditions[0]

@@ -34,6 +34,7 @@ class Fingers:
             "damping": 2.0,
             "rotational_damping": 2e-3,
             "delay": 0.0,
+            "is_delay_measured": True,
             "is_real": False,
         }
         own = usual | {"axes": ("x",)} | sheet

@@ -77,7 +77,7 @@ SQUARES = StabilityMap(
 
 def test_a_map_writes_its_files_and_says_which_points_failed(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as pool:
-        files = run_map(SQUARES, tmp_path / "new", executor=pool)
+        files = run_map(SQUARES, tmp_path / "new", workers=pool)
     assert files.failed == 1
     assert "three is no good" in files.table.read_text(encoding="utf-8")
     said = json.loads(files.boundary.read_text(encoding="utf-8"))
@@ -90,16 +90,16 @@ def test_a_map_writes_its_files_and_says_which_points_failed(tmp_path: Path) -> 
 
 def test_a_map_begun_again_computes_only_what_is_missing(tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as pool:
-        run_map(SQUARES, tmp_path, points=5, executor=pool)
+        run_map(SQUARES, tmp_path, points=5, workers=pool)
         calls.clear()
-        files = run_map(SQUARES, tmp_path, points=8, executor=pool)
+        files = run_map(SQUARES, tmp_path, points=8, workers=pool)
     assert sorted(point["x"] for point in calls) == [5.0, 6.0, 7.0]
     assert files.finding.paragraph == "the largest is 49."
 
 
 def test_a_map_can_keep_its_table_as_parquet(tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as pool:
-        files = run_map(SQUARES, tmp_path, executor=pool, form="parquet")
+        files = run_map(SQUARES, tmp_path, workers=pool, form="parquet")
     assert files.table.name == "squares.parquet"
     assert files.table.read_bytes().startswith(b"PAR1")
 
@@ -107,7 +107,7 @@ def test_a_map_can_keep_its_table_as_parquet(tmp_path: Path) -> None:
 def test_a_map_of_failures_is_an_error_that_says_the_first(tmp_path: Path) -> None:
     broken = replace(SQUARES, name="broken", evaluate=fail)
     with ThreadPoolExecutor(1) as pool, pytest.raises(StudyError, match=r"nothing at 0\.0"):
-        run_map(broken, tmp_path, executor=pool)
+        run_map(broken, tmp_path, workers=pool)
 
 
 def test_too_few_points_and_a_file_for_a_folder_are_refused(tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_a_file_that_cannot_be_written_is_noticed_before_the_sweep(tmp_path: Pat
     (tmp_path / "squares.png").mkdir()
     calls.clear()
     with ThreadPoolExecutor(1) as pool, pytest.raises(StudyError, match=r"squares\.png"):
-        run_map(SQUARES, tmp_path, executor=pool)
+        run_map(SQUARES, tmp_path, workers=pool)
     assert not calls
     assert not (tmp_path / "squares.csv").exists()
 
@@ -135,20 +135,20 @@ def fail_to_read(_table: Table) -> Mapping[str, Any]:
 def test_the_table_is_kept_even_if_reading_it_fails(tmp_path: Path) -> None:
     unread = replace(SQUARES, name="unread", summarize=fail_to_read)
     with ThreadPoolExecutor(1) as pool, pytest.raises(ZeroDivisionError):
-        run_map(unread, tmp_path, executor=pool)
+        run_map(unread, tmp_path, workers=pool)
     assert (tmp_path / "unread.csv").read_text(encoding="utf-8").count("\n") == 7
 
 
 @pytest.mark.parametrize("what", ["mujoco", "sources"])
 def test_parts_of_other_code_or_another_mujoco_are_refused(tmp_path: Path, what: str) -> None:
     with ThreadPoolExecutor(1) as pool:
-        run_map(SQUARES, tmp_path, executor=pool)
+        run_map(SQUARES, tmp_path, workers=pool)
         path = tmp_path / "squares.parts"
         first, *rest = path.read_text(encoding="utf-8").splitlines()
         found = json.dumps(json.loads(first) | {what: "older"})
         path.write_text("\n".join([found, *rest, ""]), encoding="utf-8")
         with pytest.raises(StudyError, match="other sources or another MuJoCo"):
-            run_map(SQUARES, tmp_path, executor=pool)
+            run_map(SQUARES, tmp_path, workers=pool)
 
 
 def test_an_unstable_loop_is_unstable_whatever_its_environment() -> None:

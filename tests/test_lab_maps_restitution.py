@@ -90,7 +90,7 @@ def test_mujoco_keeps_the_normal_velocity_as_newton_does() -> None:
 def test_newtons_law_is_the_nearest_to_what_rebounds() -> None:
     chosen = [p for p in points(1200) if p["setting"] == "bouncy, implicitfast"]
     with ThreadPoolExecutor(1) as executor:
-        table = sweep(evaluate, chosen, executor=executor)
+        table = sweep(evaluate, chosen, workers=executor)
     away = {
         law: float(np.sqrt(np.mean((table["energy_change"] - table[law]) ** 2)))
         for law in ("inelastic", *RESTITUTION_LAWS)

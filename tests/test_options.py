@@ -8,7 +8,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import pytest
 from hapticbridge.arguments import label, members, rule_of, types_of
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.demand.guard import Limits
 from hapticbridge.device import AXES, DeviceInfo, Hand, Motion, SimulatedDevice
 from hapticbridge.errors import CouplingError, HapticBridgeError
@@ -123,7 +124,39 @@ def test_the_force_scale_is_by_default_that_of_the_motion() -> None:
 
 def test_keywords_of_a_bridge_are_the_fields_of_its_options() -> None:
     bridge = Bridge("point_mass", substeps=2, clock=SimulatedClock())
-    assert bridge.request.options == BridgeOptions(substeps=2)
+    assert bridge.request.options == BridgeOptions(substeps=2, rate=1000.0)
+
+
+@pytest.mark.parametrize(
+    ("sheet", "chosen", "rate"),
+    [
+        ({}, {}, 1000.0),
+        ({"rate": 125.0, "delay": 0.0}, {}, 125.0),
+        ({"rate": 999.4, "delay": 0.0}, {}, 999.4),
+        ({"rate": 500.0, "delay": 2.1e-3}, {}, 500.0),
+        ({"rate": 0.5, "delay": 0.0}, {}, 1.0),
+        ({"rate": 999.9999999999991, "delay": 0.0}, {}, 1000.0),
+        ({"rate": 4000.0, "delay": 0.0}, {}, 1000.0),
+        ({"rate": 125.0, "delay": None}, {}, 1000.0),  # its samples may be a period old
+        ({"rate": 125.0, "delay": 0.0, "is_prescribed": True}, {}, 1000.0),
+        ({"rate": 125.0, "delay": 0.0}, {"rate": 1000.0}, 1000.0),
+        ({"rate": 125.0, "delay": 0.0}, {"substeps": 1}, 1000.0),
+        ({"rate": 125.0, "delay": 0.0}, {"scene_rate": 1000.0}, 1000.0),
+        ({"rate": 125.0, "delay": 0.0}, {"method": "weld"}, 1000.0),
+    ],
+)
+def test_the_loop_takes_the_rate_of_a_slower_device_which_is_stiffer(
+    sheet: dict[str, Any], chosen: dict[str, Any], rate: float
+) -> None:
+    info, own_options = replace(REAL, **sheet), BridgeOptions(**chosen)
+    assert own_options.for_devices([info]).loop_rate == rate
+    if rate < 1000.0:
+        usual, own = (default_coupling(info, 1.0 / each).stiffness for each in (1000.0, rate))
+        assert own > 1.1 * usual
+        fast = replace(info, rate=2000.0)  # it holds one force for half a tick
+        assert own_options.for_devices([info, fast]).loop_rate == 1000.0
+        half = replace(info, rate=0.5 * rate)
+        assert own_options.for_devices([half, info]).loop_rate == rate
 
 
 def test_a_coupling_without_rotational_gains_is_one_around_the_grip() -> None:

@@ -14,7 +14,7 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ def computed(scratch: Path) -> Counter[int]:
 
 
 def serial(function: Callable[[Any], Any] = functions.bound, points: Any = POINTS) -> Table:
-    return sweep(function, points, jobs=1)
+    return sweep(function, points, workers=1)
 
 
 def kept(path: Path) -> list[str]:
@@ -109,10 +109,10 @@ def test_a_result_that_no_point_gave_is_missing_or_empty() -> None:
 def test_every_executor_gives_the_same_bits(tmp_path: Path) -> None:
     expected = serial()
     with ThreadPoolExecutor(3) as threads:
-        assert is_same(sweep(functions.bound, POINTS, executor=threads, chunk=1), expected)
-    assert is_same(sweep(functions.bound, POINTS, jobs=2), expected)
+        assert is_same(sweep(functions.bound, POINTS, workers=threads, chunk=1), expected)
+    assert is_same(sweep(functions.bound, POINTS, workers=2), expected)
     for _ in range(2):  # computed, then read
-        again = sweep(functions.bound, POINTS, results=tmp_path / "kept", chunk=2, jobs=1)
+        again = sweep(functions.bound, POINTS, results=tmp_path / "kept", chunk=2, workers=1)
         assert is_same(again, expected)
 
 
@@ -121,7 +121,7 @@ def test_a_dask_cluster_of_two_workers_gives_the_same_bits() -> None:
     with distributed.LocalCluster(
         n_workers=2, processes=True, threads_per_worker=1, dashboard_address=None
     ) as cluster:
-        table = sweep(functions.bound, POINTS, scheduler=cluster.scheduler_address, chunk=1)
+        table = sweep(functions.bound, POINTS, workers=cluster.scheduler_address, chunk=1)
         assert is_same(table, serial())
 
 
@@ -129,7 +129,7 @@ def test_a_scheduler_that_does_not_answer_is_refused_beside_a_running_loop_too()
     pytest.importorskip("distributed")
 
     async def notebook() -> None:  # it runs a loop in the thread that sweeps
-        sweep(functions.bound, POINTS, scheduler="tcp://127.0.0.1:1")
+        sweep(functions.bound, POINTS, workers="tcp://127.0.0.1:1")
 
     with pytest.raises(StudyError, match=r"no dask scheduler answers at 'tcp://127\.0\.0\.1:1'"):
         asyncio.run(notebook())
@@ -137,7 +137,7 @@ def test_a_scheduler_that_does_not_answer_is_refused_beside_a_running_loop_too()
 
 def test_the_order_of_rows_is_that_of_points_whatever_ends_first() -> None:
     with ThreadPoolExecutor(2) as threads:
-        table = sweep(functions.last_ends_first, grid(n=range(8)), executor=threads, chunk=1)
+        table = sweep(functions.last_ends_first, grid(n=range(8)), workers=threads, chunk=1)
     assert table["square"].tolist() == [n * n for n in range(8)]
     assert table["square"].dtype == np.int64
 
@@ -159,7 +159,7 @@ def test_a_failed_point_records_why_and_stops_nothing(tmp_path: Path) -> None:
 
 def test_results_that_no_table_can_hold_are_failures_of_their_point(tmp_path: Path) -> None:
     for _ in range(2):
-        table = sweep(functions.oddities, grid(n=range(8)), results=tmp_path / "kept", jobs=1)
+        table = sweep(functions.oddities, grid(n=range(8)), results=tmp_path / "kept", workers=1)
         assert table.failed.tolist() == [False, *[True] * 6, False]
         np.testing.assert_equal(table["x"], [1.5, *[math.nan] * 6, 2.0])
         assert table["late"].tolist() == [""] * 7 + ["text"]
@@ -169,12 +169,12 @@ def test_results_that_no_table_can_hold_are_failures_of_their_point(tmp_path: Pa
 
 def test_other_points_reuse_those_that_are_known(scratch: Path) -> None:
     reports: list[tuple[int, int]] = []
-    sweep(functions.counted, functions.COUNTED, results=scratch / "kept", jobs=1)
+    sweep(functions.counted, functions.COUNTED, results=scratch / "kept", workers=1)
     table = sweep(
         functions.counted,
         grid(n=range(6, 15), gain=[0.1]),
         results=scratch / "kept",
-        jobs=1,
+        workers=1,
         progress=lambda done, total: reports.append((done, total)),
     )
     assert set(computed(scratch).values()) == {1}
@@ -252,7 +252,7 @@ def test_a_sweep_that_was_killed_goes_on_and_computes_nothing_twice(
     path = scratch / "kept"
     count = len(kept(path))
     assert 0 < count < len(functions.COUNTED)
-    resumed = sweep(functions.counted, functions.COUNTED, results=path, jobs=1)
+    resumed = sweep(functions.counted, functions.COUNTED, results=path, workers=1)
     often = computed(scratch)
     # in flight were at most two tasks a worker; they are computed again, and no kept point is
     assert sum(often.values()) - len(functions.COUNTED) <= len(functions.COUNTED) - count
@@ -296,14 +296,14 @@ def test_interrupts_are_held_for_a_while_and_then_arrive() -> None:
 
 def test_a_worker_that_is_killed_once_costs_nothing(scratch: Path) -> None:
     (scratch / "die").touch()
-    table = sweep(functions.counted, functions.COUNTED, chunk=4, jobs=2)
+    table = sweep(functions.counted, functions.COUNTED, chunk=4, workers=2)
     assert not (scratch / "die").exists()
     assert is_same(table, serial(functions.counted, functions.COUNTED))
 
 
 def test_points_that_end_their_worker_are_found_and_recorded(scratch: Path) -> None:
     (scratch / "poison").touch()
-    table = sweep(functions.counted, functions.COUNTED, chunk=3, jobs=2)
+    table = sweep(functions.counted, functions.COUNTED, chunk=3, workers=2)
     assert table["n"][table.failed].tolist() == [3, 4]
     assert set(table["error"][table.failed]) == {WORKER_DIED}
 
@@ -311,7 +311,7 @@ def test_points_that_end_their_worker_are_found_and_recorded(scratch: Path) -> N
 def test_ctrl_c_keeps_what_is_done(scratch: Path) -> None:
     (scratch / "ctrl-c").touch()
     again = functools.partial(
-        sweep, functions.counted, functions.COUNTED, results=scratch / "kept", jobs=1, chunk=2
+        sweep, functions.counted, functions.COUNTED, results=scratch / "kept", workers=1, chunk=2
     )
     with pytest.raises(Interrupted) as stop:
         again()
@@ -325,7 +325,7 @@ def test_ctrl_c_keeps_what_is_done(scratch: Path) -> None:
 def test_a_line_that_a_crash_has_cut_is_computed_again(scratch: Path) -> None:
     path = scratch / "kept"
     again = functools.partial(
-        sweep, functions.counted, functions.COUNTED, results=path, jobs=1, chunk=1
+        sweep, functions.counted, functions.COUNTED, results=path, workers=1, chunk=1
     )
     expected = again()
     path.write_bytes(path.read_bytes()[:-9])
@@ -336,20 +336,20 @@ def test_a_line_that_a_crash_has_cut_is_computed_again(scratch: Path) -> None:
 
 def test_a_file_of_another_function_or_version_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "kept"
-    sweep(functions.bound, POINTS, results=path, jobs=1)
+    sweep(functions.bound, POINTS, results=path, workers=1)
     with pytest.raises(StudyError, match=r"holds a sweep of sweep_functions\.bound .* start anew"):
-        sweep(functions.counted, POINTS, results=path, jobs=1)
+        sweep(functions.counted, POINTS, results=path, workers=1)
     one, two = (functools.partial(functions.plus, more=more) for more in (1, 1 + 2**-52))
     points = grid(n=[1])
-    sweep(one, points, results=tmp_path / "plus", jobs=1)
+    sweep(one, points, results=tmp_path / "plus", workers=1)
     with pytest.raises(StudyError, match=r"more=1\.0000000000000002"):
-        sweep(two, points, results=tmp_path / "plus", jobs=1)
+        sweep(two, points, results=tmp_path / "plus", workers=1)
     path.write_text(path.read_text().replace('"hapticbridge": "', '"hapticbridge": "9'))
     with pytest.raises(StudyError, match="by hapticbridge 9"):
-        sweep(functions.bound, POINTS, results=path, jobs=1)
+        sweep(functions.bound, POINTS, results=path, workers=1)
     path.write_text("[]")
     with pytest.raises(StudyError, match="holds a sweep of None"):
-        sweep(functions.bound, POINTS, results=path, jobs=1)
+        sweep(functions.bound, POINTS, results=path, workers=1)
 
 
 @pytest.mark.parametrize(
@@ -368,7 +368,8 @@ def test_a_file_of_another_function_or_version_is_refused(tmp_path: Path) -> Non
         ({"points": [{"error": 1}]}, "adds that column"),
         ({"chunk": 0}, "whole number >= 1"),
         ({"chunk": True}, "whole number >= 1"),
-        ({"scheduler": "tcp://127.0.0.1:1", "executor": Executor()}, "give one of them"),
+        ({"workers": 0}, "whole number >= 1"),
+        ({"workers": 1.5}, "whole number >= 1"),
         ({"function": lambda point: point}, "top level of a module"),
         ({"function": functools.partial(print, Future())}, "cannot be sent"),
     ],
@@ -376,7 +377,7 @@ def test_a_file_of_another_function_or_version_is_refused(tmp_path: Path) -> Non
 def test_what_cannot_be_swept_is_refused_with_a_sentence(
     arguments: dict[str, Any], sentence: str
 ) -> None:
-    usual: dict[str, Any] = {"function": functions.bound, "points": POINTS, "jobs": 1}
+    usual: dict[str, Any] = {"function": functions.bound, "points": POINTS, "workers": 1}
     with pytest.raises(StudyError, match=sentence):
         sweep(**(usual | arguments))
 
@@ -392,7 +393,7 @@ def test_a_file_that_cannot_be_used_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for path in (tmp_path, tmp_path / "file" / "below", Path("/proc/nowhere/kept")):
         with pytest.raises(StudyError, match="cannot be written"):
-            sweep(functions.bound, POINTS, results=path, jobs=1)
+            sweep(functions.bound, POINTS, results=path, workers=1)
     with pytest.raises(StudyError, match="cannot be written"):
         serial().write(tmp_path / "no" / "where.csv")
     with pytest.raises(StudyError, match="the formats are 'csv', 'parquet'"):
@@ -407,4 +408,4 @@ def test_what_is_not_installed_is_named_with_the_command_that_installs_it(
     with pytest.raises(StudyError, match=re.escape(install_command("tables"))):
         serial().write(tmp_path / "table.parquet")
     with pytest.raises(StudyError, match=re.escape(install_command("cluster"))):
-        sweep(functions.bound, POINTS, scheduler="tcp://127.0.0.1:1")
+        sweep(functions.bound, POINTS, workers="tcp://127.0.0.1:1")

@@ -246,7 +246,6 @@ def test_what_is_no_coupling_hand_or_body_is_refused(value: Any) -> None:
 def test_what_is_no_name_is_refused_with_the_names(name: Any) -> None:
     for call in (
         lambda: p.minimum_damping(COUPLING, T, discretization=name),
-        lambda: p.minimum_damping(COUPLING, T, axis=name),
         lambda: p.damping_spectrum(COUPLING, T, 1.0, discretization=name),
         lambda: p.worst_frequency(COUPLING, T, discretization=name),
         lambda: p.minimum_mass(COUPLING, T, name),

@@ -18,6 +18,7 @@ from hapticbridge.theory.bounds import (
     maximum_stiffness,
     minimum_damping,
     stiffest_coupling,
+    wall_damping,
     worst_frequency,
 )
 from hapticbridge.theory.spectrum import damping_spectrum, damping_spectrum_of, search_grid
@@ -48,10 +49,8 @@ def test_default_coupling_of_the_default_device() -> None:
 def test_largest_stiffness_is_exact(device_damping: float, share: float, period: float) -> None:
     damping = share * device_damping
     stiffness = maximum_stiffness(device_damping, period, damping)
-    coupling = Coupling(stiffness, damping, stiffness, damping)
-    for axis in ("translation", "rotation"):
-        needed = minimum_damping(coupling, period, axis=axis)
-        assert needed == pytest.approx(device_damping, rel=1e-12)
+    needed = minimum_damping(Coupling(stiffness, damping, 0, 0), period)
+    assert needed == pytest.approx(device_damping, rel=1e-12)
 
 
 @given(positive, positive, st.floats(1e-5, 1))
@@ -59,15 +58,8 @@ def test_default_leaves_a_fifth(damping: float, rotational_damping: float, perio
     coupling = stiffest_coupling(damping, rotational_damping, period)
     # K T/2 + B = 0.8 · (3/4) b + b/4 = 0.85 b
     assert minimum_damping(coupling, period) == pytest.approx(0.85 * damping, rel=1e-12)
-    assert minimum_damping(coupling, period, axis="rotation") == pytest.approx(
-        0.85 * rotational_damping, rel=1e-12
-    )
-
-
-def test_axes_do_not_mix() -> None:
-    coupling = Coupling(1000, 1, 3, 0.25)
-    assert minimum_damping(coupling, T) == pytest.approx(1.5, rel=1e-15)
-    assert minimum_damping(coupling, T, axis="rotation") == pytest.approx(0.2515, rel=1e-15)
+    turned = CouplingGrid(coupling.rotational_stiffness, coupling.rotational_damping)
+    assert minimum_damping(turned, period) == pytest.approx(0.85 * rotational_damping, rel=1e-12)
 
 
 SCHEMES: tuple[Discretization, ...] = ("backward", "tustin")
@@ -93,14 +85,26 @@ def test_tustins_damper_has_no_bound_but_a_closed_form(stiffness: float, damping
 
 def test_delay_against_a_wall_has_closed_forms() -> None:
     for delay in range(4):  # Colgate & Schenkel
-        bound = minimum_damping(Coupling(1000, 0, 0, 0), T, delay=delay)
+        bound = wall_damping(Coupling(1000, 0, 0, 0), T, delay=delay)
         assert bound == pytest.approx(1000 * (T / 2 + delay * T), rel=1e-9)
     # a(1 + 2x) − B(2x² − 1), x = cos θ, a = KT/2 = 0.5: maximum at x = a/(2B) for a < 2B
-    bound = minimum_damping(Coupling(1000, 2, 0, 0), T, delay=1)
+    bound = wall_damping(Coupling(1000, 2, 0, 0), T, delay=1)
     assert bound == pytest.approx(0.5 + 0.5**2 / 4 + 2, rel=1e-9)
+    assert wall_damping(WALL, T, discretization="tustin", delay=2) == np.inf
 
 
-def test_no_damping_suffices_for_every_environment_behind_a_delayed_coupling() -> None:
+@given(stiffnesses, st.floats(0, 50))
+def test_one_tick_of_delay_has_a_closed_form_in_every_scene(k: float, damping: float) -> None:
+    # with x = sin²(θ/2): (1 − x)(4 (β² + K β) x + K²), largest inside for y² > 2 K²
+    y = k + 2 * damping / T
+    closed = T * y**3 / (2 * (y**2 - k**2)) if y**2 > 2 * k**2 else 2 * T * k**2 / y
+    law = Coupling(k, damping, 0, 0)
+    assert minimum_damping(law, T, delay=1) == pytest.approx(closed, rel=1e-9)
+    # y² = 3 K² is the stiffest: K = 4 b/(3 √3 T)
+    assert closed > 0.75 * np.sqrt(3) * k * T * (1 - 1e-9)
+
+
+def test_no_damping_suffices_if_the_tool_too_gets_its_force_late() -> None:
     frequency = np.linspace(1, np.pi / T, 500)
     delayed = damping_spectrum_of(lambda z: 1000 / z, T, frequency)
     assert np.isinf(delayed).any()
@@ -174,7 +178,9 @@ def test_grid_agrees_with_single_couplings() -> None:
     singles = [[Coupling(float(row[0]), float(column), 0, 0) for column in b] for row in k]
     bounds: tuple[Callable[[Any], Any], ...] = (
         lambda c: minimum_damping(c, T),
-        lambda c: minimum_damping(c, T, delay=2, filter_time=1e-3),
+        lambda c: minimum_damping(c, T, delay=2.5, filter_time=1e-3),
+        lambda c: minimum_damping(c, T, delay=3, ticks_per_sample=2),
+        lambda c: wall_damping(c, T, delay=2, filter_time=1e-3),
         lambda c: minimum_damping(c, T, discretization="tustin"),
         lambda c: environment_minimum_damping(c, T, 0.02, "semi_implicit"),
         lambda c: minimum_mass(c, T, "explicit"),
@@ -200,11 +206,12 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     *((partial(call, bad), words) for call, words in OUT_OF_RANGE for bad in (-1, np.nan, np.inf)),
     (lambda: minimum_damping(WALL, 0.0), "period is"),
     (lambda: maximum_stiffness(2, T / 2, damping=2), "no stiffness is passive"),
-    (lambda: minimum_damping(WALL, T, axis="x"), "choose one of 'rotation', 'translation'"),  # type: ignore[call-overload]
     (lambda: CouplingGrid([1.0, 2.0], [1.0, 2.0, 3.0]), "do not broadcast"),
-    (lambda: minimum_damping(WALL, T, delay=0.5), "whole number of samples"),  # type: ignore[call-overload]
+    (lambda: wall_damping(WALL, T, delay=0.5), "whole number of samples"),  # type: ignore[arg-type]
+    (lambda: wall_damping(WALL, T, delay=51), r"delay is 51; it must be .*, 0 to 50"),
     (lambda: minimum_damping(WALL, T, delay=True), "delay is True"),
-    (lambda: minimum_damping(WALL, T, delay=51), r"delay is 51; it must be .*, 0 to 50"),
+    (lambda: minimum_damping(WALL, T, delay=50.1), r"delay is 50.1 ticks; it must be .*50"),
+    (lambda: minimum_damping(WALL, T, ticks_per_sample=0), "ticks per sample is 0"),
     (lambda: z_width(2, T, delay=10**30), "delay is"),
     (lambda: minimum_damping(WALL, T, discretization="euler"), "one of 'backward', 'tustin'"),  # type: ignore[call-overload]
     (lambda: minimum_mass(WALL, T, "rk4"), "one of 'explicit', 'implicit', 'semi_implicit'"),  # type: ignore[arg-type]
@@ -257,20 +264,20 @@ FINE = np.union1d(np.linspace(1e-4, np.pi, 20_001), np.geomspace(1e-6, 1e-1, 400
     st.floats(1, 1e5),
     st.floats(0, 50),
     st.sampled_from(SCHEMES),
-    st.integers(0, 6),
+    st.one_of(st.integers(0, 6), st.floats(0, 6)),
     st.one_of(st.just(0.0), st.floats(-3, 2).map(lambda log: 10**log)),
 )
 @settings(max_examples=100)
 @example(1000, 0.5606992373916568, "backward", 2, 1e-3)  # a maximum near the first cell
 def test_bound_and_worst_frequency_are_those_of_a_dense_sweep(
-    stiffness: float, damping: float, scheme: Discretization, delay: int, lag: float
+    stiffness: float, damping: float, scheme: Discretization, delay: float, lag: float
 ) -> None:
     assume(scheme == "backward" or damping == 0 or lag > 0)  # Tustin's damper alone has no bound
     coupling = Coupling(stiffness, damping, 0, 0)
     how: Any = {"discretization": scheme, "delay": delay, "filter_time": lag * T}
     bound = minimum_damping(coupling, T, **how)
     swept = damping_spectrum(coupling, T, FINE / T, **how)
-    scale = stiffness * T * (delay + 1) + damping
+    scale = stiffness * T * (delay + 1) ** 2 + damping
     # between its points the sweep misses a maximum by (7 · half a step)²/2, 2e-7 of the ripple
     assert swept.max() == pytest.approx(bound, rel=1e-6, abs=1e-6 * scale)
     assert swept.max() <= bound * (1 + 1e-9) + 1e-9 * scale
@@ -284,16 +291,15 @@ def test_bound_and_worst_frequency_are_those_of_a_dense_sweep(
 def test_spectrum_is_the_condition_as_printed(
     scheme: Discretization, tau: float, delay: int
 ) -> None:
+    law = Coupling(1500, 0.7, 0, 0)
+    options: Any = {"discretization": scheme, "delay": delay, "filter_time": tau}
     theta = np.linspace(1e-2, 3.1, 300)
     z = np.exp(1j * theta)
     rate = (1 - 1 / z) / T if scheme == "backward" else 2 / T * (z - 1) / (z + 1)
-    late = (1500 + 0.7 * rate / (1 + tau * rate)) * z**-delay
-    if delay:  # against a wall
-        needed = T / 2 * np.real((1 - 1 / z) * late) / (1 - np.cos(theta))
-    else:  # (2), any environment
-        needed = T / 2 * (1 - np.cos(theta)) / np.real((1 - 1 / z) / late)
-    law = Coupling(1500, 0.7, 0, 0)
-    options: Any = {"discretization": scheme, "delay": delay, "filter_time": tau}
+    transfer = 1500 + 0.7 * rate / (1 + tau * rate)
+    needed = T / 2 * (1 - np.cos((delay + 1) * theta)) / np.real((1 - 1 / z) / transfer)
+    of_any = damping_spectrum_of(lambda _: transfer, T, theta / T, delay=delay)
+    np.testing.assert_allclose(of_any, needed, rtol=1e-8, atol=1e-8)
     found = damping_spectrum(law, T, theta / T, **options)
     np.testing.assert_allclose(found, needed, rtol=1e-8, atol=1e-8)
 

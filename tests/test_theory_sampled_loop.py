@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
-from hapticbridge.theory.bounds import minimum_damping
+from hapticbridge.theory.bounds import wall_damping
 from hapticbridge.theory.sampled_loop import (
     SampledLoop,
     WorstHand,
@@ -51,7 +51,7 @@ def test_run_against_a_wall_ends_where_the_bound_says(
 ) -> None:
     k_and_b = coupling(stiffness, damping)
     loop = SampledLoop(k_and_b, period, delay=delay, filter_time=filter_time)
-    bound = minimum_damping(k_and_b, period, delay=delay, filter_time=filter_time)
+    bound = wall_damping(k_and_b, period, delay=delay, filter_time=filter_time)
     assert stability_limit(loop) == pytest.approx(bound, rel=SHARE)
 
 

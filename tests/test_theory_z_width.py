@@ -22,7 +22,6 @@ from hapticbridge.theory.transfer import CouplingGrid
 from hapticbridge.theory.z_width import (
     ANY_HAND,
     NO_LIMIT_CYCLES,
-    WALL,
     WITHOUT_HAND,
     free_device_damping,
     free_device_stiffness,
@@ -115,16 +114,16 @@ def test_without_delay_the_line_meets_the_device(b: float, period: float, tau: f
 
 @given(st.floats(0.1, 50), st.integers(1, 4), st.sampled_from([0.0, 1e-3]))
 @settings(max_examples=15)
-def test_with_delay_line_is_where_wall_meets_device(b: float, delay: int, tau: float) -> None:
+def test_with_delay_the_line_meets_the_device(b: float, delay: int, tau: float) -> None:
     z = z_width(b, T, delay=delay, filter_time=tau, points=7)
     inside = z.limit > 0
     pairs = CouplingGrid(z.limit[inside], z.damping[inside])
     needed = np.asarray(minimum_damping(pairs, T, delay=delay, filter_time=tau))
     np.testing.assert_allclose(needed, b, rtol=1e-9)
-    assert z.limit[0] == pytest.approx(b / (T * (delay + 0.5)), rel=1e-6)
+    assert z.limit[0] == pytest.approx(2 * b / (T * (delay + 1) ** 2), rel=1e-6)
     assert z.limit[-1] == 0
-    assert set(z.limited_by) == {WALL}
-    assert "holds for every scene" in z.notes[0]
+    assert set(z.limited_by) == {ANY_HAND}
+    assert z.notes == ()
 
 
 OUT_OF_RANGE: list[tuple[Callable[[Any], Any], str]] = [
@@ -222,9 +221,9 @@ def test_worst_frequency_of_known_cases() -> None:
     assert worst_frequency(Coupling(1000, 0, 0, 0), T, delay=3) == 0.0
     damper = Coupling(1e-3, 2, 0, 0)
     assert worst_frequency(damper, T, delay=1) * T == pytest.approx(np.pi / 2, rel=1e-5)
-    # with one sample of delay cos θ = K T/(4 B)
+    # with one tick of delay cos θ = K²/(y² − K²), y = K + 2B/T
     worst = worst_frequency(CouplingGrid(1000, [0.1, 1.0, 2.0]), T, delay=1)
-    np.testing.assert_allclose(np.cos(worst * T), [1, 0.25, 0.125], atol=1e-6)
+    np.testing.assert_allclose(np.cos(worst * T), [1, 1 / 8, 1 / 24], atol=1e-6)
 
 
 @pytest.mark.parametrize("mass", [1e3, 1e6, 1e9, 1e15])

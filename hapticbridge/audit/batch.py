@@ -7,7 +7,6 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from hapticbridge.audit import audit
 from hapticbridge.confinement import ForeignSceneError
 from hapticbridge.errors import RecordingError, StudyError, choices
 from hapticbridge.files import finite_or_null
-from hapticbridge.sweep import Interrupted, Table, Value, check_format, sweep
+from hapticbridge.sweep import Interrupted, Table, Value, Workers, check_format, sweep
 
 FEW = 8
 """Number of recordings below which no processes are started. A process takes 3 s to start, as long
@@ -64,9 +63,7 @@ def audit_all(
     strict: bool = False,
     accepts_unverified: bool = False,
     in_process: bool = False,
-    jobs: int | None = None,
-    executor: Executor | None = None,
-    scheduler: str | None = None,
+    workers: Workers = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Table:
     """Audits recordings and returns one row for each, most critical first.
@@ -84,11 +81,8 @@ def audit_all(
         strict: True accepts only (14) itself; see ``audit``.
         accepts_unverified: True counts ``unverified`` as a success; see ``audit``.
         in_process: True simulates without the limits of a child process; see ``audit``.
-        jobs: Largest number of processes; 1 uses the present process. The default is the number of
-            cores, and 1 for fewer than 8 recordings.
-        executor: Executor to use instead of processes.
-        scheduler: Address of a dask.distributed scheduler to use instead of processes. Its workers
-            must see the files under these names.
+        workers: As for ``sweep``, by default 1 for fewer than 8 recordings. The workers of a
+            scheduler must see the files under these names.
         progress: Called with the number of finished recordings and the number of all.
 
     Raises:
@@ -98,8 +92,9 @@ def audit_all(
     """
     if not paths:
         raise RecordingError("audit needs at least one recording")
-    if jobs is None and len(paths) < FEW:
-        jobs = 1
+    if workers is None and len(paths) < FEW:
+        workers = 1
+    is_far = isinstance(workers, str)
     try:
         table = sweep(
             partial(
@@ -108,11 +103,9 @@ def audit_all(
                 accepts_unverified=accepts_unverified,
                 in_process=in_process,
             ),
-            [{"file": str(path.absolute() if scheduler else path)} for path in paths],
+            [{"file": str(path.absolute() if is_far else path)} for path in paths],
             chunk=1,
-            executor=executor,
-            scheduler=scheduler,
-            jobs=jobs,
+            workers=workers,
             progress=progress,
         )
     except Interrupted as stop:

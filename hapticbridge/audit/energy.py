@@ -370,12 +370,9 @@ def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict
     unfelt = unfelt_work(parameters, gains, whole, rows["lever"][: len(ticks)], (moved, turned))
     late = np.sum(sent[:, :3] * late_moved, axis=1) + np.sum(sent[:, 3:] * late_turned, axis=1)
     dissipation, guarding = np.zeros(len(ticks)), parameters.guarding
-    least, late_least = (
-        np.maximum(np.abs(each) - guarding.resolution, 0.0) for each in (moved, late_moved)
-    )
     if parameters.device_damping is not None:
         parts = dissipated_by_damping(
-            parameters, late_least, late_turned, block.interval, ~block.is_first
+            parameters, late_moved, late_turned, block.interval, ~block.is_first
         )
         dissipation = _summed(parts, before["device_dissipation"])
     assumed = replace(
@@ -384,6 +381,7 @@ def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict
         device_rotational_damping=guarding.assumed_rotational_damping,
     )
     burned = dissipated_by_damping(assumed, moved, turned, block.interval, ~block.is_first)
+    least = np.maximum(np.abs(moved) - guarding.resolution, 0.0)
     shown = dissipated_by_damping(assumed, least, turned, block.interval, ~block.is_first)
     # Σ w·ε with errors of half a step, by summation by parts
     forces = np.vstack([[before[f"sent_{axis}"] for axis in "xyz"], sent[:, :3]])

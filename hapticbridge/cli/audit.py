@@ -257,8 +257,7 @@ class Audit:
                     strict=self.strict,
                     accepts_unverified=self.accept_unverified,
                     in_process=self.in_process,
-                    jobs=self.jobs,
-                    scheduler=self.scheduler,
+                    workers=self.scheduler or self.jobs,
                     progress=show,
                 )
         except Interrupted as stop:

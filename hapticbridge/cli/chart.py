@@ -187,7 +187,7 @@ class Stability:
                 self.out,
                 points=self.points,
                 form=self.form,
-                scheduler=self.scheduler,
+                workers=self.scheduler,
                 progress=show,
             )
 

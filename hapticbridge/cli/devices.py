@@ -16,7 +16,7 @@ from hapticbridge.device.registry import all_drivers, driver_named
 from hapticbridge.device.watchdog import HANG
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.realtime.doctor import LONGEST, SHORTEST, Diagnosis, diagnose
-from hapticbridge.run.options import BridgeOptions
+from hapticbridge.run.options import USUAL_RATE, BridgeOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +189,8 @@ class Doctor:
         hapticbridge doctor --rate 2000 --duration 60
     """
 
-    rate: float = shared(BridgeOptions, "rate")
+    rate: float = shared(BridgeOptions, "rate", USUAL_RATE)
+    """Ticks per second."""
     duration: float = option(20.0, unit="s", least=SHORTEST, most=LONGEST)
     """Seconds to measure; the loops that are compared take turns."""
     as_json: bool = option(False, flag="json")

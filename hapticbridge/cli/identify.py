@@ -13,7 +13,7 @@ from rich.table import Table
 
 from hapticbridge.arguments import option, shared
 from hapticbridge.cli.terminal import notify, out, plain, print_json, progress, write_figure
-from hapticbridge.cli.zwidth import next_command
+from hapticbridge.cli.zwidth import next_command, rate_for
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.demand.loop_setting import Lag, delay_ticks
@@ -80,14 +80,22 @@ def measured_sheet(result: Identification, profile: Profile) -> DeviceInfo:
     return profile.fill(replace(result.info, **measured))
 
 
-def coupling_of_run(result: Identification, profile: Profile) -> RunCoupling:
+def coupling_of_run(
+    result: Identification, profile: Profile, rate: float | None = None
+) -> RunCoupling:
     """Returns the coupling that a run chooses by itself with the profile of what was measured."""
-    period, info = nominal_period(result), measured_sheet(result, profile)
+    info = measured_sheet(result, profile)
+    period = period_of(rate_for(rate, info))
     return RunCoupling.of(default_method(), period, default_coupling(info, period))
 
 
 def print_result(
-    result: Identification, z: ZWidth | None, coupling: RunCoupling, device: str, info: DeviceInfo
+    result: Identification,
+    z: ZWidth | None,
+    coupling: RunCoupling,
+    device: str,
+    info: DeviceInfo,
+    rate: float | None = None,
 ) -> None:
     """Prints what was measured, how surely, and the coupling to use.
 
@@ -97,6 +105,7 @@ def print_result(
         coupling: What ``coupling_of_run`` returned.
         device: The device as the user named it.
         info: What ``measured_sheet`` returned.
+        rate: Rate in Hz that the user chose for the loop; None for the run's own choice.
     """
     for turns, units in ((False, ("kg", "N s/m", "N")), (True, ("kg m²", "N m s/rad", "N m"))):
         names = zip(("mass", "damping", "friction"), units, strict=True)
@@ -137,13 +146,13 @@ def print_result(
         return
     out.print(
         f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness "
-        f"{'of a wall ' if z.delay else ''}is {z.limit[0]:.4g} N/m at B_law = 0 "
+        f"is {z.limit[0]:.4g} N/m at B_law = 0 "
         f"({z.corner_limited_by}){_with_more_damping(z)}{_if_in_time(info, z.period)}"
     )
     out.print(f"use {coupling.sentences()[0]}")
     requested = coupling.requested
     if requested is not None:
-        command = next_command(requested.stiffness, requested.damping, 1.0 / nominal_period(result))
+        command = next_command(requested.stiffness, requested.damping, rate)
         out.print(f"next: {plain(f'{command} --device {shlex.quote(device)}')}")
 
 
@@ -165,7 +174,7 @@ def _if_in_time(info: DeviceInfo, period: float) -> str:
 def _with_more_damping(z: ZWidth) -> str:
     """Returns the largest safe stiffness where the coupling's damper raises it; or nothing.
 
-    Behind a delay the damper lowers what a wall asks of the device.
+    Behind a delay the damper lowers what is needed at low frequencies.
     """
     at = int(np.argmax(z.limit))
     if z.limit[at] < 1.01 * z.limit[0]:
@@ -224,7 +233,8 @@ class Identify:
     """Turn to each side in rad."""
     force_share: float = option(FORCE_SHARE, least=1e-3, most=1.0)
     """Share of the device's force limit that may be used."""
-    rate: float = shared(BridgeOptions, "rate")
+    rate: float | None = shared(BridgeOptions, "rate")
+    """Ticks per second while measuring, by default 1000, and of the loop that is advised."""
     save: Path | None = None
     """Write the profile to this file; by default into the folder of your own profiles, for a real
     device only."""
@@ -239,7 +249,7 @@ class Identify:
         """Measures and prints; returns the exit code."""
         check_ending(self.plot)
         check_ending(self.zwidth)
-        period = period_of(self.rate)
+        period = period_of(rate_for(self.rate, None))
         duration = duration_at(period) if self.duration is None else self.duration
         if self.plot is not None and self.plot == self.zwidth:
             raise HapticBridgeError(f"--plot and --zwidth both name '{self.plot}'")
@@ -271,13 +281,14 @@ class Identify:
             duration=duration,
             workspace=getattr(device, "workspace", None),
         )
-        coupling = coupling_of_run(result, profile)
+        coupling = coupling_of_run(result, profile, self.rate)
         path = self._place(profile, is_real=device.info.is_real)
         # first, so that a file that cannot be written costs nothing that was measured
         if self.as_json:
             print_json(facts(result, z, coupling, path))
         else:
-            print_result(result, z, coupling, self.device, measured_sheet(result, profile))
+            sheet = measured_sheet(result, profile)
+            print_result(result, z, coupling, self.device, sheet, self.rate)
         if path is not None:
             kept = _write(profile, path)
             notify(f"wrote {path}{kept and f'; the profile that was there is now {kept}'}")

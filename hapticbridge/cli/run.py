@@ -40,6 +40,7 @@ from hapticbridge.run.hands import Grasp, GripAxis, check_grasps
 from hapticbridge.run.options import (
     AUTO,
     DEFAULT_OPTIONS,
+    USUAL_RATE,
     BridgeOptions,
     RunSetup,
     steady_rotational_stiffness,
@@ -346,15 +347,13 @@ class Run:
                 with compiling(self.scene):
                     scene = compile_scene(source, self.grip, as_is=self.as_is)
                 self._warn_of_faults(source, scene)
-                chosen = self
-                if self.options.substeps is None:
-                    chosen = self._with(substeps=self._own_substeps(source, scene))
             joint = self._own_grip_axis(scene)
             if not joint:
                 self._refuse_grip_scale()
             device = device_for(scene, self.device, notify, joint)
             # what is refused from here on must not leave it claimed
             stack.callback(checked_close(device))
+            chosen = self._for_devices([device.info])
             if joint and self.grip_axis is None and device.info.grip_axis is None:
                 notify(f"'{device.info.name}' has no grip axis, so joint '{joint}' moves freely")
             elif joint:
@@ -362,9 +361,12 @@ class Run:
                 found = scene.findings
                 scene = compile_scene(source, grasp.grips, as_is=self.as_is, warns=False)
                 scene.findings = found
-                return self._without_buttons()._feel(
+                return chosen._without_buttons()._feel(
                     scene, [grasp], clock, stack, window, interrupts
                 )
+            if self.options.substeps is None:
+                with err.status("trying the scene …"):
+                    chosen = chosen._with(substeps=chosen._own_substeps(source, scene))
             return chosen._feel(scene, device, clock, stack, window, interrupts)
 
     @property
@@ -398,6 +400,16 @@ class Run:
     def _with(self, **changes: Any) -> Run:
         """Returns the run with changed options."""
         return replace(self, options=replace(self.options, **changes))
+
+    def _for_devices(self, infos: Sequence[DeviceInfo]) -> Run:
+        """Returns the run at the rate for its devices; says if that is not the usual one."""
+        options = self.options.for_devices(infos)
+        if self.options.rate is None and options.loop_rate < USUAL_RATE:
+            notify(
+                f"the loop runs at {options.loop_rate:.4g} Hz, as often as the device has a new "
+                f"sample; walls are harder so than at {USUAL_RATE:g} Hz (--rate sets another)"
+            )
+        return replace(self, options=options)
 
     def _with_buttons(self, grasp: Grasp) -> Grasp:
         return replace(grasp, clutch=self.options.clutch, dead_man=self.options.dead_man)
@@ -466,13 +478,14 @@ class Run:
         with err.status("trying the scene …"), compiling(self.scene):
             scene = compile_scene(source, grips, as_is=self.as_is)
             self._warn_of_faults(source, scene)
-        grasps = []
+        grasps, infos = [], []
         for grip, joint, name in held:
             own = scene.of_hand(grips.index(grip))
             opened = device_for(own, name, notify, joint)
             stack.callback(opened.close)
+            infos.append(opened.info)
             grasps.append(self._grasp(grip, joint, opened))
-        one = self._without_buttons()
+        one = self._without_buttons()._for_devices(infos)
         return one._feel(scene, self._with_their_buttons(grasps), clock, stack, window, interrupts)
 
     def _with_their_buttons(self, grasps: Sequence[Grasp]) -> list[Grasp]:
@@ -494,7 +507,7 @@ class Run:
         if self.options.method is not None:
             return 1
         ticks = self._scene_ticks(scene)
-        period = max(ticks, 1) * period_of(self.options.rate)
+        period = max(ticks, 1) * period_of(self.options.loop_rate)
         setting = Setting(NO_HAND, period, contact=self.options.contact or "rigid")
         count, moved = own_substeps(source, scene, setting)
         if ticks:  # more steps would not be in time
@@ -513,7 +526,7 @@ class Run:
     def _scene_ticks(self, scene: Scene) -> int:
         if self.options.scene_rate != AUTO or self.fast:
             return self.options.scene_ticks
-        period = period_of(self.options.rate)
+        period = period_of(self.options.loop_rate)
         return scene_ticks_for(busy_step_time(scene, default_method(), period), period)
 
     def _feel(

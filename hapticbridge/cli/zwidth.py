@@ -30,7 +30,7 @@ from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.identify.z_width import SHARES, MeasuredWidth, measure_width, measured_points
 from hapticbridge.kernel.parameters import whole_ticks
 from hapticbridge.plotting import check_ending
-from hapticbridge.run.options import DEFAULT_OPTIONS, BridgeOptions
+from hapticbridge.run.options import BridgeOptions
 from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.theory.bounds import (
     NEEDED_SHARE,
@@ -45,10 +45,16 @@ from hapticbridge.units import format_si
 _ARGUMENTS = Arguments(HapticBridgeError)
 
 
-def next_command(stiffness: float, damping: float, rate: float) -> str:
-    """Returns the command that runs a scene with this coupling."""
+def next_command(stiffness: float, damping: float, rate: float | None) -> str:
+    """Returns the command that runs a scene with this coupling, at the rate if one was chosen."""
     command = f"hapticbridge run SCENE --stiffness {stiffness:.6g} --damping {damping:.6g}"
-    return command if rate == DEFAULT_OPTIONS.rate else f"{command} --rate {rate:.6g}"
+    return command if rate is None else f"{command} --rate {rate:.6g}"
+
+
+def rate_for(rate: float | None, info: DeviceInfo | None) -> float:
+    """Returns the rate in Hz that was chosen, or the one at which a run has the device."""
+    options = BridgeOptions(rate=rate)
+    return (options if info is None else options.for_devices([info])).loop_rate
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +82,7 @@ class Zwidth:
     """Coulomb friction of the device in N."""
     resolution: float | None = shared(DeviceInfo, "resolution")
     """Step of the device's position in m; by default exact."""
-    rate: float = shared(BridgeOptions, "rate")
+    rate: float | None = shared(BridgeOptions, "rate")
     delay: float = 0.0
     """Time in s from position to force, beyond the hold; it counts as whole ticks."""
     filter_time: float = option(0.0, unit="s", least=0.0)
@@ -91,11 +97,12 @@ class Zwidth:
         check_ending(self.plot)
         if self.axis is not None and self.measure is None:
             raise HapticBridgeError("--axis goes with --measure DEVICE")
-        period, axis = period_of(self.rate), self.axis or "x"
+        axis = self.axis or "x"
         device = None if self.measure is None else self._opened(self.measure, axis)
+        info = None if device is None else device.info
         try:
             with err.status("computing …"):
-                z = self._computed(period, None if device is None else device.info)
+                z = self._computed(period_of(rate_for(self.rate, info)), info)
             measured = None
             if device is not None:
                 clock = RealClock() if device.info.is_real else SimulatedClock()
@@ -217,14 +224,15 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
         table.add_row(line.name, stiffness, f"{line.largest_damping:.4g} N s/m", reason)
     out.print(table)
     reasons = {line.name: line.reason for line in z.lines}
-    reason = reasons.get(z.corner_limited_by, f"in every scene, {NEEDED_SHARE:.0%} of b needed")
-    out.print(f"limited by: {z.corner_limited_by} ({reason})")
+    out.print(f"limited by: {z.corner_limited_by} ({reasons[z.corner_limited_by]})")
     for note in z.notes:
         out.print(f"note: {note}")
     (sentence,) = recommended_coupling(z).sentences()
     at, safe = z.corner.damping, z.corner.stiffness / STIFFNESS_MARGIN
     of = f": 80 % of the {safe:.4g} N/m that are safe at B_law = {at:.3g} N s/m"
-    out.print(f"use {sentence}{'' if z.delay else of}")
+    if z.delay:
+        of = f": it needs at most {NEEDED_SHARE:.0%} of b, in every scene"
+    out.print(f"use {sentence}{of}")
     if command is None:
         out.print(
             "'hapticbridge run' has no low-pass: leave --filter-time out for a run's coupling"
@@ -293,7 +301,7 @@ class Bound:
     """Coupling stiffness K in N/m."""
     damping: float = shared(Coupling, "damping", 0.0)
     """Requested damping B of the coupling in N s/m."""
-    rate: float = shared(BridgeOptions, "rate")
+    rate: float | None = shared(BridgeOptions, "rate")
     filter_time: float | None = option(None, unit="s", least=0.0)
     """Time constant in s of the low-pass among the alternatives; by default one period."""
     device: str | None = None
@@ -310,7 +318,8 @@ class Bound:
         """Computes and prints; returns the exit code."""
         check_ending(self.plot)
         info = self._info()
-        period = period_of(self.rate)
+        rate = rate_for(self.rate, info)
+        period = period_of(rate)
         coupling = Coupling(self.stiffness, self.damping, 0.0, 0.0)
         filter_time = period if self.filter_time is None else self.filter_time
         ways = alternatives(coupling, period, filter_time)
@@ -339,12 +348,11 @@ class Bound:
                 }
             )
         else:
-            limit = "" if condition is None else condition.clause
-            self._print(ways, shown, period, b, limit=limit, holds=holds)
+            self._print(ways, shown, period, b, info, condition)
             if condition is not None and (b is None or condition.steps is not None):
                 out.print(plain(condition.sentence()))
         if self.plot is not None:
-            title = f"K = {self.stiffness:g} N/m, B = {self.damping:g} N s/m at {self.rate:g} Hz"
+            title = f"K = {self.stiffness:g} N/m, B = {self.damping:g} N s/m at {rate:g} Hz"
             write_figure(draw_alternatives(ways, title, b), self.plot)
         return 1 if holds is False else 0
 
@@ -380,9 +388,8 @@ class Bound:
         shown: RunCoupling,
         period: float,
         b: float | None,
-        *,
-        limit: str,
-        holds: bool | None,
+        info: DeviceInfo | None,
+        condition: DampingCondition | None,
     ) -> None:
         method = default_method()
         (sentence,) = shown.sentences()
@@ -399,8 +406,8 @@ class Bound:
         least = method.compensated_share * self.stiffness * period
         if self.device is None:
             out.print(
-                "a delay of the device is not in it: --device counts it, for every scene, and "
-                "'zwidth --delay' has the couplings that it allows"
+                "a delay of the device is not in it: --device counts it, and 'zwidth --delay' has "
+                "the couplings that it allows"
             )
         if self.damping < least:
             out.print(
@@ -411,9 +418,11 @@ class Bound:
             return
         needed = ways[0].needed
         if b >= needed:
-            but = "" if holds else " but for its encoder's steps"
-            out.print(f"device damping {b:g} >= {needed:g} N s/m: passive in any hand{limit}{but}")
-            if not holds:
+            limit = "" if condition is None else condition.clause
+            if has_steps := condition is not None and condition.holds is False:
+                limit += " but for its encoder's steps"
+            out.print(f"device damping {b:g} >= {needed:g} N s/m: passive in any hand{limit}")
+            if has_steps:
                 return
             out.print(
                 f"method {method.name} needs the larger of KT/2 and B: any K up to "
@@ -425,24 +434,25 @@ class Bound:
             out.print(f"next: {plain(command)}")
             return
         out.print(f"device damping {b:g} < {needed:g} N s/m: [red]not passive in any hand[/]")
-        self._print_remedies(b, needed, period)
+        self._print_remedies(b, needed, period, (info and info.rate) or math.inf)
 
-    def _print_remedies(self, b: float, needed: float, period: float) -> None:
-        lag, changes = default_method().compensated_share, []
+    def _print_remedies(self, b: float, needed: float, period: float, max_rate: float) -> None:
+        lag, changes, damper = default_method().compensated_share, [], ""
         b *= NEEDED_SHARE
         needed /= NEEDED_SHARE
         if law_damping(self.stiffness, self.damping, period, lag) > 0:
             stiffness = min(self.stiffness, 2 * b / period)
             most = largest_effective_damping(b, stiffness, period, lag)
-            changes.append(f"lower the damping to {most:.4g} N s/m")
+            damper = f"lower the damping to {most:.4g} N s/m"
         if self.stiffness * period > 2 * b:
             changes.append(f"lower the stiffness to {2 * b / period:.4g} N/m")
-            changes.append(f"raise the rate to {self.stiffness / (2 * b):.4g} Hz")
+            if (rate := self.stiffness / (2 * b)) <= max_rate:
+                changes.append(f"raise the rate to {rate:.4g} Hz")
         out.print("with 15 % in reserve:")
-        if len(changes) == 3:
-            out.print(f"  {changes[0]}, and {changes[1]} or {changes[2]}, or")
+        if damper and changes:
+            out.print(f"  {damper}, and {' or '.join(changes)}, or")
         else:
-            for change in changes:
+            for change in filter(None, (damper, *changes)):
                 out.print(f"  {change}, or")
         out.print(f"  take a device with {needed:.4g} N s/m")
 

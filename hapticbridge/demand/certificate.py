@@ -12,9 +12,9 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.demand.loop_setting import (
     IN_TIME,
     Axis,
-    Lag,
     LoopSetting,
     device_period,
+    guarded_lag,
     required_damping,
 )
 from hapticbridge.demand.methods import Method, default_method
@@ -68,7 +68,8 @@ def default_coupling(
 
     The result is the requested coupling: K and B = B' + the method's own damping, so that the law
     uses B' without clipping. It needs 85 % of b. Behind a device that is late the ratio B'/K is the
-    one with the largest K (``theory.bounds.stiffest_late_coupling``). If several evaluations per
+    one with the largest K (``theory.bounds.stiffest_late_coupling``); a delay that is stated and
+    not measured counts as one tick more. If several evaluations per
     tick need more, or friction does not hold the encoder's steps, K and B' are lowered together;
     both conditions are linear in both. Without any friction no coupling is free of swings by steps,
     so damping alone decides, and the condition says so.
@@ -93,7 +94,7 @@ def default_coupling(
     coupling = stiffest_coupling(damping, rotational, period)
     checked_substeps(law_evaluations, CouplingError)
     method = default_method(law_evaluations) if method is None else method
-    lag = Lag.of(info, period)
+    lag = guarded_lag(info, period)
     if lag != IN_TIME:
         linear = stiffest_late_coupling(damping, period, lag.delay, lag.ticks_per_sample)
         coupling = replace(coupling, stiffness=linear[0], damping=linear[1])
@@ -198,7 +199,7 @@ class StepCondition:
         return text if self.holds else f"{text}; {self.remedy}"
 
 
-IF_TIMELY = "if its forces come within the tick"
+IF_AT_ONCE = "if its forces come at once"
 """Limit of a certificate for a delay of 0 that the device states and no measurement confirms."""
 
 
@@ -216,7 +217,8 @@ class DampingCondition:
             at best, None if unknown.
         ticks_per_sample: Ticks for which one force is held, 1 at best.
         steps: Condition on the encoder's steps along this kind of axis; None without one.
-        is_delay_stated: True if no measurement confirms the delay.
+        unconfirmed_delay: Largest constant delay in s that the damping bears, of the stated one and
+            one tick more; None if a measurement confirms the delay.
         is_felt: False for axes that are sensed without a motor. The hand puts energy into the scene
             there without work of its own, so no damping bounds what it gets back along the axes
             with a motor (Barbagli & Salisbury 2003).
@@ -229,7 +231,7 @@ class DampingCondition:
     delay: float | None = 0.0
     ticks_per_sample: int = 1
     steps: StepCondition | None = None
-    is_delay_stated: bool = False
+    unconfirmed_delay: float | None = None
     is_felt: bool = True
 
     @property
@@ -257,11 +259,12 @@ class DampingCondition:
     @property
     def clause(self) -> str:
         """Limit of a certificate for a delay that no measurement confirms; or empty."""
-        if not self.is_delay_stated or self.delay is None:
+        if self.unconfirmed_delay is None:
             return ""
-        if not self.delay:
-            return f", {IF_TIMELY}"
-        return f", if its forces come equally late, by at most {format_si(self.delay, 's')}"
+        if not self.unconfirmed_delay:
+            return f", {IF_AT_ONCE}"
+        most = format_si(self.unconfirmed_delay, "s")
+        return f", if its forces come equally late, by at most {most}"
 
     def lack(self, bound: str) -> str:
         """Returns a clause on what is missing; ``bound`` names the damping that is needed."""
@@ -321,6 +324,10 @@ def _condition(loop: LoopSetting, axis: Axis, available: float | None) -> Dampin
     needed, remedy = loop.needed(axis), ""
     if available is not None and available < needed:
         remedy = _remedy(loop, axis, available)
+    unconfirmed, lag = None, guarded_lag(loop.info, loop.period)
+    if lag != loop.lag:
+        bears = available is not None and available >= loop.needed(axis, lag)
+        unconfirmed = lag.delay if bears else loop.lag.delay
     return DampingCondition(
         axis,
         needed,
@@ -329,7 +336,7 @@ def _condition(loop: LoopSetting, axis: Axis, available: float | None) -> Dampin
         None if loop.info.delay is None else loop.lag.delay,
         loop.lag.ticks_per_sample,
         _steps(loop) if axis == "translation" else None,
-        not loop.info.is_delay_measured,
+        unconfirmed,
     )
 
 

@@ -166,7 +166,8 @@ class Certification:
     @property
     def _if(self) -> str:
         """Clause on a delay that no measurement confirms."""
-        return next(filter(None, (each.clause for each in self.conditions)), "")
+        timed = [each for each in self.conditions if each.unconfirmed_delay is not None]
+        return min(timed, key=lambda each: each.unconfirmed_delay or 0.0).clause if timed else ""
 
     @property
     def fact(self) -> str:
@@ -210,7 +211,9 @@ def certification_of(
     A run that was not as the conditions assume certifies no device that meets them.
     """
     conditions = run_conditions(info, parameters, method)
-    kept = Timekeeping.from_times(times, parameters, conditions if method.has_law else ())
+    kept = Timekeeping.from_times(
+        times, parameters, conditions if method.has_law else (), info.rate
+    )
     verdict = is_run_certified(conditions, method)
     if info.is_prescribed:
         standing = Standing.NO_HAND

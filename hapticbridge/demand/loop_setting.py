@@ -15,8 +15,8 @@ from hapticbridge.device.base import DeviceInfo
 from hapticbridge.errors import CouplingError
 from hapticbridge.kernel.ledger import SLACK_SHARE
 from hapticbridge.kernel.parameters import ROUNDING, RunParameters, checked_substeps, whole_ticks
-from hapticbridge.theory.bounds import late_minimum_damping, minimum_damping
-from hapticbridge.theory.transfer import delayed_by
+from hapticbridge.theory.bounds import minimum_damping
+from hapticbridge.theory.transfer import CouplingGrid, delayed_by
 
 Axis = Literal["translation", "rotation"]
 
@@ -74,7 +74,24 @@ class Lag:
 
 
 IN_TIME = Lag()
-"""A device that gives a sample in each tick and answers it within the tick."""
+"""A device that gives a sample in each tick and answers it at once."""
+
+
+UNCONFIRMED = 1e-3
+"""Time in s by which a delay may exceed what a device states: one message of USB, or a tick of the
+usual rate. A larger value makes the couplings of unmeasured devices softer."""
+
+
+def guarded_lag(info: DeviceInfo, period: float) -> Lag:
+    """Returns the lag for which a coupling is chosen, with T in s.
+
+    A delay that the device states and no measurement confirms counts as one tick more, at most
+    ``UNCONFIRMED``: links and services take a time that no data sheet has.
+    """
+    lag = Lag.of(info, period)
+    if info.delay is None or info.is_delay_measured or info.is_prescribed:
+        return lag
+    return replace(lag, delay=lag.delay + min(period, UNCONFIRMED))
 
 
 # Device damping required by a coupling
@@ -97,7 +114,7 @@ def required_damping(
 
     K and B are those of the law (``Method.law_coupling``), not the effective ones. With one
     evaluation of the law per tick b = K T/2 + B, and more behind a device that is late
-    (``theory.bounds.late_minimum_damping``). With m evaluations of the law per tick the handle
+    (``theory.bounds.minimum_damping``). With m evaluations of the law per tick the handle
     moves by an m-th of its step for each, and the mean wrench is sent. There is no closed form; b
     is the smallest value for which
 
@@ -132,12 +149,11 @@ def required_damping(
     k = coupling.stiffness if is_linear else coupling.rotational_stiffness
     damping = coupling.damping if is_linear else coupling.rotational_damping
     if checked_substeps(law_evaluations, CouplingError) == 1:
-        if lag == IN_TIME:
-            return float(minimum_damping(coupling, period, axis=axis))
         if k == 0.0:
             return lag.ticks_per_sample * damping
-        late = late_minimum_damping(k, damping, period, lag.delay, lag.ticks_per_sample)
-        return float(late)
+        law, ticks = CouplingGrid(k, damping), lag.delay / period
+        n = lag.ticks_per_sample
+        return float(minimum_damping(law, period, delay=ticks, ticks_per_sample=n))
     count, held = law_evaluations * lag.ticks_per_sample, lag.ticks_per_sample * period
     b = damping * law_evaluations / period
     if k == 0.0:
@@ -228,9 +244,10 @@ class LoopSetting:
         is_linear = axis == "translation"
         return self.scale * self.force_scale if is_linear else self.force_scale / self.scale
 
-    def needed(self, axis: Axis) -> float:
-        """Returns the damping that the device needs in N s/m or N m s/rad."""
-        needed = required_damping(self.law, self.period, self.law_evaluations, axis, self.lag)
+    def needed(self, axis: Axis, lag: Lag | None = None) -> float:
+        """Returns the damping that the device needs in N s/m or N m s/rad; None takes its lag."""
+        lag = self.lag if lag is None else lag
+        needed = required_damping(self.law, self.period, self.law_evaluations, axis, lag)
         return self.ratio(axis) * needed
 
     def needs(self) -> tuple[float, float]:

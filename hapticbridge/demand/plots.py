@@ -18,7 +18,7 @@ from hapticbridge.demand.methods import (
     guaranteed_methods,
 )
 from hapticbridge.plotting import new_figure
-from hapticbridge.theory.bounds import late_minimum_damping, minimum_damping, worst_frequency
+from hapticbridge.theory.bounds import minimum_damping, worst_frequency
 from hapticbridge.theory.spectrum import damping_spectrum
 from hapticbridge.theory.transfer import Discretization, transmission_line_spectrum
 from hapticbridge.theory.z_width import ZWidth
@@ -67,9 +67,9 @@ def alternatives(requested: Coupling, period: float, filter_time: float) -> tupl
     The methods with a guarantee come first, the default one leading. Each uses the law of
     ``Method.law_coupling``; if its damping would be negative, the effective damping exceeds the
     requested one. Laws with the requested damping follow: at half the period; with a first-order
-    low-pass behind the damper; with Tustin's damper; with one sample of delay against a wall, and
-    for any environment. Last is a lossless transmission line of equal static stiffness, with
-    impedance Z = K T and one sample each way, terminated by the device.
+    low-pass behind the damper; with Tustin's damper; with one tick of delay. Last is a lossless
+    transmission line of equal static stiffness, with impedance Z = K T and one sample each way,
+    terminated by the device.
 
     Args:
         requested: Requested K and B; only the translation counts.
@@ -80,7 +80,7 @@ def alternatives(requested: Coupling, period: float, filter_time: float) -> tupl
         CouplingError: An argument is out of range.
 
     References:
-        Brown & Colgate 1997, eqs. (2), (6), (7) and section 6; Colgate & Schenkel 1997 (wall).
+        Brown & Colgate 1997, eqs. (2), (6), (7) and section 6.
     """
 
     def way(
@@ -114,29 +114,10 @@ def alternatives(requested: Coupling, period: float, filter_time: float) -> tupl
         way("B_law = B at half the period", step=period / 2),
         way(f"B_law = B, low-pass of {1e3 * filter_time:g} ms on it", low_pass=filter_time),
         way("B_law = B, Tustin's damper", scheme="tustin"),
-        way("B_law = B, one tick late, against a wall", delay=1),
-        _one_tick_late(requested, period),
+        way("B_law = B, one tick late", delay=1),
         Alternative(
             "transmission line of that stiffness", float(line.max()), None, (frequency, line)
         ),
-    )
-
-
-def _one_tick_late(requested: Coupling, period: float) -> Alternative:
-    """Returns the requirement of a device that answers a tick late, before any scene.
-
-    Its spectrum is that without delay times (1 − cos 2ωT)/(1 − cos ωT).
-    """
-    k, b = requested.stiffness, requested.damping
-    frequency = _frequencies(period)
-    spectrum = damping_spectrum(requested, period, frequency)
-    spectrum = 4.0 * np.cos(0.5 * frequency * period) ** 2 * spectrum
-    top = int(np.argmax(spectrum))
-    return Alternative(
-        "B_law = B, one tick late, any scene",
-        float(late_minimum_damping(k, b, period, delay=period)),
-        float(frequency[top]) if top else 0.0,
-        (frequency, spectrum),
     )
 
 

@@ -8,7 +8,7 @@ once. A run certifies its device only if it kept its time, which means two thing
 
        b >= N (1/s + j/T) + N(t_d + t_w) − N(t_d)
 
-   N(t) is what a delay t needs (``theory.bounds.late_minimum_damping``), N = N(t_d). s is the
+   N(t) is what a delay t needs (``theory.bounds.minimum_damping``), N = N(t_d). s is the
    smaller of two shares: deadlines that were kept, and samples that were new. In ticks without a
    new sample the tool moves, so that these ask for m (m − 1) (K T)²/(4 N) more, with one new sample
    in m ticks on average. j is the mean time by which a sample came later after its deadline than
@@ -32,11 +32,11 @@ from enum import StrEnum
 
 from hapticbridge.demand.certificate import DampingCondition
 from hapticbridge.kernel.hand_energy import INSTANT
-from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.parameters import ROUNDING, RunParameters
 from hapticbridge.kernel.record import TickFlag
 from hapticbridge.kernel.swing_watch import PUSH, STAND
-from hapticbridge.theory.bounds import late_minimum_damping
-from hapticbridge.theory.transfer import MAX_DELAY
+from hapticbridge.theory.bounds import minimum_damping
+from hapticbridge.theory.transfer import MAX_DELAY, CouplingGrid
 from hapticbridge.units import format_si
 
 NOT_KEPT = "the run did not keep its time"
@@ -171,9 +171,9 @@ MANY_KEPT = 0.95
 A virtual machine is stopped by its host now and then, and nothing inside it helps."""
 
 
-SPARSE = 0.75
-"""Share of ticks with a new sample below which the device is said to be slower than the loop; no
-unit. Two clocks of one rate that drift past each other repeat fewer."""
+FEW = 0.99
+"""Share of the samples due that were new below which a rate is proposed that the device keeps; no
+unit. Two clocks that differ by a few parts in 10,000 repeat fewer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +197,11 @@ class Timekeeping:
         scene_speed: Share of them that it gave, 0 to 1.
         scene_silence: Longest time in s without a new one.
         silence: Longest silence of the device for which the force faded; None without one.
-        sample_rate: New samples per second of a device slower than the loop; 0 for another.
+        sample_rate: New samples per second of a device that gave fewer than were due; 0 for
+            another.
+        due_rate: New samples per second that were due: those that the device states, or that the
+            loop reads if that is less.
+        is_rate_stated: True if they are those that the device states.
     """
 
     rate: float
@@ -216,12 +220,19 @@ class Timekeeping:
     scene_silence: float
     silence: Silence | None
     sample_rate: float
+    due_rate: float
+    is_rate_stated: bool
 
     @classmethod
     def from_times(
-        cls, times: RunTimes, parameters: RunParameters, conditions: Sequence[DampingCondition]
+        cls,
+        times: RunTimes,
+        parameters: RunParameters,
+        conditions: Sequence[DampingCondition],
+        stated_rate: float | None = None,
     ) -> Timekeeping:
         """Judges the times of a run by its device conditions; none for a run without a law."""
+        rate, stated = 1.0 / parameters.period, stated_rate or math.inf
         share = times.ticks / times.due if times.due > times.ticks else 1.0
         least = min(share, times.fresh)
         silence = silence_in(times, parameters)
@@ -236,7 +247,7 @@ class Timekeeping:
         is_paid = times.delay_energy <= INSTANT
         is_borne = bool(verdicts) and all(each.holds is not False for each in conditions)
         return cls(
-            rate=least / parameters.period if times.ticks else 0.0,
+            rate=least * rate if times.ticks else 0.0,
             share=share,
             fresh=times.fresh,
             mean_delay=times.mean_delay,
@@ -252,14 +263,14 @@ class Timekeeping:
             scene_silence=times.scene_silence,
             silence=silence,
             sample_rate=sample_rate,
+            due_rate=min(rate, stated),
+            is_rate_stated=stated <= rate * (1.0 + ROUNDING),
         )
 
     @property
     def words(self) -> str:
         """Effective rate, share of the deadlines, and the mean lateness of samples and forces."""
-        lost = (
-            "" if self.fresh >= self.share else f", {100.0 * self.fresh:.3g} % of the samples new"
-        )
+        lost = "" if self.fresh >= self.share else f", {self._shortfall}"
         late = f", {self._late}" if self._late else ""
         if self.scene_rate is not None:
             speed = f"{100.0 * self.scene_speed:.3g} % of its speed"
@@ -268,6 +279,18 @@ class Timekeeping:
                 late += f", once without a result for {format_si(self.scene_silence, 's')}"
         of_what = "new samples at " if lost else ""
         return f"{of_what}{self.rate:.4g} Hz, {self._percent} of the deadlines kept{lost}{late}"
+
+    @property
+    def _shortfall(self) -> str:
+        """Samples that came and that were due, with the rate that suits the device."""
+        found = (
+            f"{self.fresh * self.due_rate:.4g} of the {self.due_rate:.4g} new samples per second"
+        )
+        found += " that the device states" if self.is_rate_stated else " that the loop reads"
+        if not self.sample_rate or self.slowness:
+            return found
+        rate = f"{self.sample_rate:.4g}"
+        return f"{found} (--rate {rate}, or rate={rate} in its data sheet, suits it)"
 
     @property
     def remark(self) -> str:
@@ -302,7 +325,7 @@ class Timekeeping:
         if not self.sample_rate or self.is_kept:
             return ""
         return (
-            f"; the device gave new samples at {self.sample_rate:.0f} Hz; in the ticks between "
+            f"; the device gave new samples at {self.sample_rate:.4g} Hz; in the ticks between "
             "them the handle slips toward the tool, so that the hand feels less force: try "
             f"{self.remedy}"
         )
@@ -351,21 +374,21 @@ def _scene_speed(times: RunTimes, ticks: int) -> float:
 
 
 def _sample_rate(times: RunTimes, period: float, was_silent: bool) -> float:
-    """Returns the new samples per second in Hz of a device slower than the loop; 0 for another.
+    """Returns the new samples per second in Hz of a device that gave too few; 0 for another.
 
     A silence for which the force faded does not count. Where many deadlines were missed, the loop
     was slow.
     """
     heard = times.due * period - (times.silence if was_silent else 0.0)
     is_late = times.ticks < MANY_KEPT * times.due
-    if is_late or times.fresh * times.due * period >= SPARSE * heard:
+    if is_late or times.fresh * times.due * period >= FEW * heard:
         return 0.0
     return times.new_samples / heard
 
 
 def _remedy(*, is_realtime: bool, sample_rate: float) -> str:
     if sample_rate:
-        return f"--rate {sample_rate:.0f} with the stiffness left to the run"
+        return f"--rate {sample_rate:.4g} with the stiffness left to the run"
     request = "" if is_realtime else "--realtime, "
     return (
         f"{request}a lower --stiffness, a lower --rate with the stiffness left to the run, or what "
@@ -395,11 +418,16 @@ def _at_times(
         # samples that did not come: the tool moved in the ticks between them
         count = max(times.ticks / times.new_samples, ticks) if times.new_samples else math.inf
         needed += ratio * kappa * period * count * (count - ticks)
+        law = CouplingGrid(k, b)
+
+        def at(delay: float) -> float:
+            late = delay / period
+            if late > MAX_DELAY * ticks:  # beyond what the theory takes
+                return math.inf
+            return float(minimum_damping(law, period, delay=late, ticks_per_sample=ticks))
+
         delay = condition.delay or 0.0
-        whole = math.inf  # beyond what the theory takes
-        if delay + times.mean_delay <= MAX_DELAY * ticks * period:
-            whole = float(late_minimum_damping(k, b, period, delay + times.mean_delay, ticks))
-        needed += ratio * (whole - float(late_minimum_damping(k, b, period, delay, ticks)))
+        needed += ratio * (at(delay + times.mean_delay) - at(delay))
     at_times = replace(condition, needed=needed)
     if at_times.holds is False and condition.holds is not False:
         return replace(at_times, remedy=remedy)

@@ -540,7 +540,7 @@ def charge_lateness(s: State, interval: float, ticks: int) -> None:
     with b >= K T/2 + B' + c T. c is what a torque across the motion costs. In the m ticks since the
     last sample the tool has stretched the spring by σ, and the hand may have felt the force of the
     first alone. The second part is at most (m − 1) K²/(2 (K + 2B'/T)) ‖d‖², what
-    ``theory.bounds.late_minimum_damping`` takes for any scene. d is the handle's
+    ``theory.bounds.minimum_damping`` takes for any scene. d is the handle's
     step in m, t the time in s since the last sample, T the period. The hand has felt a held force
     while the spring was stretched by d; the device burned b ‖d‖²/t. D is below zero for a sample in
     time; a late one pays later, because the handle slips until the springs hold less by D. b in

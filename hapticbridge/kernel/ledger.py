@@ -24,8 +24,7 @@ The accounts of energy, all in J; q = force_scale / scale:
 ``damper`` and ``environment`` are the passivity controllers. w is the wrench on the device, δp its
 motion, b its damping, t the time between two new samples, W the work of the scene's actuators and
 of external forces. W_u is ``passivity_controller.unfelt_work``, R that of ``observe_release``, H
-what steps of the encoder may hide (``observe_energy``, with the least motion δp that they show in
-both accounts).
+what steps of the encoder may have added (``observe_energy``).
 """
 
 from __future__ import annotations
@@ -572,21 +571,10 @@ def take_scene_works(energy: Part, scene: Part) -> None:
 
 
 @compiled
-def least_motion(moved: Vector, resolution: float) -> Vector:
-    """Returns the least motion in m that stepped positions show: max(|δp_i| − Δ, 0) per axis."""
-    return (
-        max(abs(moved[0]) - resolution, 0.0),
-        max(abs(moved[1]) - resolution, 0.0),
-        max(abs(moved[2]) - resolution, 0.0),
-    )
-
-
-@compiled
 def meter_device(s: State, moved: Vector, turned: Vector, interval: float) -> None:
     """Adds the work on the device, and the least dissipation of its damper, b ‖δp‖²/t.
 
     Over a time t the damper dissipates ∫ b v² dt >= b ‖δp‖²/t, for every motion that ends δp away.
-    Behind steps Δ of an encoder an axis moved by at least max(|δp_i| − Δ, 0).
     Before the first tick and in a pause, the time that the device took to move is unknown; its
     dissipation then counts as zero.
 
@@ -599,8 +587,7 @@ def meter_device(s: State, moved: Vector, turned: Vector, interval: float) -> No
     w, energy = s.loop.wrench_on_device, s.energy
     energy.device_energy += dot(vector_of(w), moved) + dot(vector_of(w[3:6]), turned)
     if s.loop.tick > s.guard.start_tick:
-        least = least_motion(moved, s.observer.resolution)
-        energy.device_dissipation += s.run.device_damping / interval * dot(least, least)
+        energy.device_dissipation += s.run.device_damping / interval * dot(moved, moved)
         energy.device_dissipation += (
             s.run.device_rotational_damping / interval * dot(turned, turned)
         )

@@ -14,7 +14,6 @@ from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, Part, State
 from hapticbridge.kernel.hand_energy import INSTANT
 from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import held_energy, pulled
-from hapticbridge.kernel.ledger import least_motion
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, GuardParameters
 from hapticbridge.kernel.pose import Vector, norm, scaled
 
@@ -300,11 +299,11 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     delivered = unburnt = held = 0.0
     w, a = s.loop.wrench_on_device, observer.axis_energy
     b, b_r = observer.assumed_damping, observer.assumed_rotational_damping
-    least = least_motion(moved, observer.resolution)
     for i in range(3):
         linear = (w[i] - b * rate * moved[i]) * moved[i]
         angular = (w[3 + i] - b_r * rate * turned[i]) * turned[i]
-        shown = b * rate * (moved[i] * moved[i] - least[i] * least[i])
+        least = max(abs(moved[i]) - observer.resolution, 0.0)
+        shown = b * rate * (moved[i] * moved[i] - least * least)
         a[i] = max(a[i] + (linear + shown), -limit)
         a[3 + i] = max(a[3 + i] + angular, -limit)
         delivered += linear + angular

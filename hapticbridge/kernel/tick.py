@@ -962,9 +962,7 @@ def shown_tick(
 def simulate_shown(
     states: tuple[NDArray[np.void], NDArray[np.void]],
     samples: NDArray[np.void],
-    external_flags: NDArray[np.int64],
-    elapsed: NDArray[np.float64],
-    scene_steps: NDArray[np.int64],
+    recorded: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]],
     own: tuple[NDArray[np.void], NDArray[np.void], NDArray[np.void]],
     rows: NDArray[np.void],
 ) -> int:
@@ -973,9 +971,8 @@ def simulate_shown(
     Args:
         states: The bound states of the loop and of the scene.
         samples: Device samples, one per tick.
-        external_flags: ``STALE_SAMPLE`` as recorded, one per tick.
-        elapsed: Time between two samples in s, one per tick.
-        scene_steps: ``scene_step`` as recorded, one per tick. A step is taken over where it rises.
+        recorded: One each per tick: ``STALE_SAMPLE`` as recorded, the time between two samples in
+            s, and ``scene_step`` as recorded. A step is taken over where it rises.
         own: The bound records of loop and scene, and the scene's sample.
         rows: Receives the records; as long as ``samples``.
 
@@ -983,6 +980,7 @@ def simulate_shown(
         Count of completed ticks, as for ``simulate``.
     """
     s, row = states[0][0], own[0]
+    external_flags, elapsed, scene_steps = recorded
     for k in range(samples.size):
         s.loop.external_flags = external_flags[k]
         is_due = scene_steps[k] > s.shown.scene_step

@@ -1,7 +1,7 @@
 """Energy that the times of samples and forces may have given to the hand, sample by sample.
 
 The condition b >= N assumes that samples come each T and that each force acts a constant time after
-its sample: the stated delay of the device t_d in whole ticks, 0 for one that answers within one. In
+its sample: the stated delay of the device t_d in whole ticks, 0 for one that answers at once. In
 a run, samples come late or not at all, and a force is sent some time after its sample. So each run
 keeps the account by which the condition is proved, at the times that it had:
 
@@ -30,7 +30,7 @@ what wrenches on their way will cost, motion has paid for before.
 No property of the law is assumed: force level, slip, lever, changed gains, contacts, several hands
 and slower scenes are all in W_c and V. From any sample on, the hand gets at most A + C + q V, and
 what the scene had or created. In a strict scene with b >= N and constant times, A stays near 0; see
-``theory.bounds.late_minimum_damping``. What a scene within its slack created is added to A for a
+``theory.bounds.minimum_damping``. What a scene within its slack created is added to A for a
 device that answers late: only the condition of a device in time pays for it.
 
 References:

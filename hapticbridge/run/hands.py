@@ -201,7 +201,7 @@ def resolve_hands(
     if options.method is None:
         options = replace(options, method=default_method(has_several_hands=True).name)
     _refuse_unsuited(options)
-    common = replace(options, scene_rate=options.rate, pipelined=False)
+    common = replace(options, scene_rate=options.loop_rate, pipelined=False)
     setups: list[RunSetup] = []
 
     def resolve(

@@ -8,7 +8,7 @@ device, and refuses what they cannot do. The live loop and the studies share
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, cast
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.arguments import check_fields, is_number, option, shown
-from hapticbridge.clock import RATE, Clock, RealClock, period_of
+from hapticbridge.clock import LOWEST_RATE, RATE, Clock, RealClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.demand.guard import (
@@ -50,6 +50,7 @@ from hapticbridge.errors import (
 from hapticbridge.kernel.parameters import (
     MAX_BUTTONS,
     MAX_SCENE_TICKS,
+    ROUNDING,
     SAME_AXES,
     SUBSTEPS,
     UNGUARDED,
@@ -118,6 +119,11 @@ SAME_FRAME = Workspace()
 """Workspace with equal axes and scales; the device starts at the grip."""
 
 
+USUAL_RATE = 1000.0
+"""Ticks per second if neither the user nor a slower device names a rate. Walls of a lower rate are
+softer; a higher one leaves less time for the scene."""
+
+
 AUTO: Literal["auto"] = "auto"
 """Rate of the scene that is chosen by what its step takes."""
 
@@ -131,7 +137,9 @@ class BridgeOptions:
     """Options of a bridge; the defaults suit a device with known damping.
 
     Attributes:
-        rate: Ticks per second.
+        rate: Ticks per second. By default 1000, or as many as a slower device has new samples, if
+            its delay is known too; at that rate it bears a stiffer coupling. With substeps or a
+            scene rate of your own it is 1000.
         substeps: MuJoCo steps per tick; with more than one, the mean of their wrenches is sent, and
             the device needs another damping. For a slower scene they are the steps between two of
             its results. By default one; 'hapticbridge run' takes as many as keep the file's own
@@ -178,7 +186,7 @@ class BridgeOptions:
         HapticBridgeError: A value is out of range; the message names the valid ones.
     """
 
-    rate: float = option(1000.0, unit=RATE.unit, least=RATE.least, most=RATE.most)
+    rate: float | None = option(None, unit=RATE.unit, least=RATE.least, most=RATE.most)
     substeps: int | None = field(default=None, metadata=SUBSTEPS)
     scene_rate: float | Literal["auto"] = option(AUTO, unit="Hz")
     method: str | None = None
@@ -207,6 +215,30 @@ class BridgeOptions:
             )
 
     @property
+    def loop_rate(self) -> float:
+        """The chosen ticks per second, or ``USUAL_RATE``."""
+        return USUAL_RATE if self.rate is None else self.rate
+
+    def for_devices(self, infos: Sequence[DeviceInfo]) -> BridgeOptions:
+        """Returns the options with the rate chosen, for the devices of all hands.
+
+        A loop at the device's rate has one tick per sample, T_d, and K is up to 2 b/T_d. A faster
+        one has n, and K is up to b/(T_d √(n − 1)) (``theory.bounds.minimum_damping``). With a
+        delay it is less in both, and still more in the first.
+        """
+        rate = self.loop_rate
+        is_open = self.rate is None and self.substeps is None and self.scene_rate == AUTO
+        stated = [
+            info.rate
+            for info in infos
+            if info.rate and info.delay is not None and not info.is_prescribed
+        ]
+        if is_open and self.rendering_method.has_law and len(stated) == len(infos):
+            own = max(LOWEST_RATE, *stated)
+            rate = own if own < rate * (1.0 - ROUNDING) else rate
+        return replace(self, rate=rate)
+
+    @property
     def scene_ticks(self) -> int:
         """Ticks between two results of the scene; 0 for every tick, also with "auto".
 
@@ -215,12 +247,13 @@ class BridgeOptions:
         """
         if self.scene_rate == AUTO:
             return 0
-        least, rate = self.rate / MAX_SCENE_TICKS, self.scene_rate
-        if not is_number(rate) or not least <= float(rate) <= self.rate:
+        most, rate = self.loop_rate, self.scene_rate
+        least = most / MAX_SCENE_TICKS
+        if not is_number(rate) or not least <= float(rate) <= most:
             raise HapticBridgeError(
-                f"scene rate is {shown(rate)} Hz; it must be 'auto', or {least:g} to {self.rate:g}"
+                f"scene rate is {shown(rate)} Hz; it must be 'auto', or {least:g} to {most:g}"
             )
-        ticks = round(self.rate / float(rate))
+        ticks = round(most / float(rate))
         return 0 if ticks < 2 else ticks
 
     @property
@@ -326,7 +359,7 @@ def _usual_coupling(
 
     ``evaluations`` is the number of times that a tick evaluates the coupling's law.
     """
-    method, period = options.rendering_method, period_of(options.rate)
+    method, period = options.rendering_method, period_of(options.loop_rate)
     scales = options.workspace.scales
     usual = default_coupling(info, period, *scales, evaluations, method)
     if not scene_ticks:
@@ -428,7 +461,7 @@ class RunSetup:
         Raises:
             HapticBridgeError: Two of them exclude each other; the message names both.
         """
-        method, period = options.rendering_method, period_of(options.rate)
+        method, period = options.rendering_method, period_of(options.loop_rate)
         substeps, ticks = options.substeps or 1, options.scene_ticks
         is_real_clock = clock.name == RealClock.name
         if options.scene_rate == AUTO and is_real_clock and method.can_be_slow:

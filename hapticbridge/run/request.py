@@ -90,7 +90,7 @@ class RunRequest:
             as_is=scene.as_is,
             grasps=tuple(replace(grasp, device=info.name) for grasp, info in named),
             devices=tuple(devices),
-            options=options,
+            options=options.for_devices(devices),
             clock=clock.name,
         )
 
@@ -124,7 +124,7 @@ class RunRequest:
             own = scene, self.grasps, self.devices, options, clock
             return resolve_hands(*own, is_recorded=is_recorded)
         if scene_ticks is not None and options.scene_rate == AUTO and clock.name == RealClock.name:
-            options = replace(options, scene_rate=options.rate / max(scene_ticks, 1))
+            options = replace(options, scene_rate=options.loop_rate / max(scene_ticks, 1))
         [grasp], [info] = self.grasps, self.devices
         return (
             RunSetup.resolve(scene, info, grasp.coupling, options, clock, is_recorded=is_recorded),

@@ -232,9 +232,7 @@ class SlowScene:
             count = simulate_shown(
                 states,
                 samples[part],
-                external_flags[part],
-                elapsed[part],
-                scene_steps[part],
+                (external_flags[part], elapsed[part], scene_steps[part]),
                 own,
                 rows[part],
             )

@@ -42,6 +42,7 @@ comes to rest in the other, which is a limit cycle.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import overload
 
 import numpy as np
@@ -51,17 +52,16 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
 from hapticbridge.theory.spectrum import (
     LOWEST_ANGLE,
-    needed_for_fixed_environment,
+    needed_behind_delay,
+    supremum,
     wall_supremum,
 )
 from hapticbridge.theory.transfer import (
-    MAX_DELAY,
-    Axis,
     CouplingGrid,
     Discretization,
     SampledLaw,
     checked,
-    coupling_transfer,
+    delayed_by,
     plain,
     scalar,
     together,
@@ -80,15 +80,14 @@ def worst_frequency(
     period: float,
     *,
     discretization: Discretization = "backward",
-    delay: int = 0,
+    delay: float = 0.0,
     filter_time: float = 0.0,
 ) -> float | NDArray[np.float64]:
     """Returns the frequency at which ``damping_spectrum`` reaches its supremum.
 
     Without a delay it is Nyquist's, π/T, for every coupling; the spectrum of a spring alone is
-    flat. With a delay, against a wall, a soft damper leaves it at low frequency. A strong damper
-    moves it towards π/((d + 1) T) and its odd multiples. Arguments, errors and sources are those of
-    ``minimum_damping``.
+    flat. With a delay, a spring alone leaves it at low frequency. A damper moves it up, at most to
+    π/((d + 1) T). Arguments, errors and sources are those of ``minimum_damping``.
 
     Returns:
         ω in rad/s, shaped like the coupling: 0.0 if the supremum is the limit for ω → 0, π/T if it
@@ -96,23 +95,24 @@ def worst_frequency(
         is flat at its top. Of several equal maxima any one.
     """
     law = SampledLaw.validated(coupling, period, discretization, delay, filter_time)
-    k, b, period, samples, tau, is_ringing = law
-    if samples == 0:
-        return plain(np.full(k.shape, np.pi / period))
-    # both rules agree for a spring alone, and the backward difference is finite at Nyquist
-    scheme: Discretization = "backward" if is_ringing else discretization
-    top, angle = wall_supremum(k, b, period, scheme, samples, tau)
-    # limit at ω → 0: K T/2 − B plus d T K for the delay
-    at_zero = (samples + 0.5) * k * period - b
-    nyquist = np.asarray(np.pi)
-    transfer = coupling_transfer(k, b, period, nyquist, scheme, tau) * (-1.0) ** samples
-    at_end = needed_for_fixed_environment(transfer, period, nyquist)
-    close = SAME * (k * period * (samples + 1) + b)
-    angle = np.where(at_zero >= top - close, 0.0, angle)
-    angle = np.where(at_end >= np.maximum(top, at_zero) - close, np.pi, angle)
-    if is_ringing:
-        angle = np.where(b > 0, np.pi, angle)
-    return plain(np.asarray(angle / period))
+    if law.delay == 0:
+        return plain(np.full(law.stiffness.shape, np.pi / law.period))
+    needed = _for_any_environment(law.finite)
+    top, angle = supremum(needed, law.finite, 1)
+    one = np.ones((1,) * law.stiffness.ndim)
+    angle = np.where(needed(LOWEST_ANGLE * one) >= top * (1 - SAME), 0.0, angle)
+    angle = np.where(needed(np.pi * one) >= top * (1 - SAME), np.pi, angle)
+    if law.rings:
+        angle = np.where(law.damping > 0, np.pi, angle)
+    return plain(np.asarray(angle / law.period))
+
+
+def _for_any_environment(
+    law: SampledLaw, count: int = 1
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Returns the spectrum of a law for any environment, with its delay in samples."""
+    late = law.delay / count
+    return lambda theta: needed_behind_delay(law.transfer, law.period, theta, late, count)
 
 
 STIFFNESS_MARGIN = 0.8
@@ -139,9 +139,9 @@ def minimum_damping(
     period: float,
     *,
     discretization: Discretization = ...,
-    delay: int = ...,
+    delay: float = ...,
     filter_time: float = ...,
-    axis: Axis = ...,
+    ticks_per_sample: int = ...,
 ) -> float: ...
 
 
@@ -151,9 +151,9 @@ def minimum_damping(
     period: float,
     *,
     discretization: Discretization = ...,
-    delay: int = ...,
+    delay: float = ...,
     filter_time: float = ...,
-    axis: Axis = ...,
+    ticks_per_sample: int = ...,
 ) -> float | NDArray[np.float64]: ...
 
 
@@ -162,11 +162,11 @@ def minimum_damping(
     period: float,
     *,
     discretization: Discretization = "backward",
-    delay: int = 0,
+    delay: float = 0.0,
     filter_time: float = 0.0,
-    axis: Axis = "translation",
+    ticks_per_sample: int = 1,
 ) -> float | NDArray[np.float64]:
-    """Returns the least device damping with which a coupling is passive.
+    """Returns the least device damping with which a coupling is passive, in every scene.
 
         backward     b >= K T/2 + B'                     low-passed: K T/2 + B' T/(T + 2τ)
         tustin       b >= K T/2 for B' = 0, else inf     low-passed: K T/2 + B' T/(2τ)
@@ -174,129 +174,95 @@ def minimum_damping(
     B' is the damping of the law, the ``damping`` of the coupling given here. At equality the device
     loses nothing and gains nothing; the paper states the condition with >.
 
-    Without a delay the bound is necessary. It is sufficient for any passive hand and any
-    environment that is discrete-time passive (14). With a low-pass, sufficiency is shown for linear
-    hands and environments only.
+    A device that is **late** gets a force (d + φ) n T after its sample, d whole and 0 <= φ < 1, and
+    holds it for n T. The tool gets its force at once. With C of the coupling, w = e^{−jψ},
 
-    With a delay of d samples the bound holds against a **wall**, that is for a tool that does not
-    move:
+        b >= n T max_θ max{ s_d, (1 − φ) s_d + φ s_{d+1} } mean_i 1/Re{(1 − w)/C(e^{jψ})}
+        s_d = sin²((d + 1)θ/2),    ψ = (θ + 2πi)/n,  i = 0 … n − 1,    0 < θ <= π
 
-        b >= (K T/2) sin((2d + 1)θ/2)/sin(θ/2) − B' cos((d + 1)θ)  for all θ;  B' = 0: K (T/2 + d T)
+        spring alone, n = 1, φ = 0    b >= (d + 1)² K T/2
+        no delay, backward            b >= n T [(n − 1) K² + y²]/(2y),    y = K + 2 B'/T
 
-    The coupling's damper may lower this bound. ``late_minimum_damping`` has the bound for every
-    environment.
+    The larger of the two s is taken, because a part of a tick may ask less of a damper than none.
+    By the backward rule the bound holds for every constant delay up to the given one.
+
+    It is **sufficient** for every passive hand and every discrete-time passive scene (14), also
+    nonlinear and changing ones. For n = 1 and φ = 0 it is **necessary**: at the worst frequency a
+    lossless hand and a lossless tool exist that swing for ever at equality. With a part of a tick
+    it is known to be necessary for a spring alone. ``wall_damping`` has the bound of a tool that
+    does not move.
+
+    **Derivation.** f acts on the tool at once, so that the scene takes Σ f·δx of the Σ f·δh. With
+    j over samples, i over ticks and e = h − x the hand gets at most
+
+        E <= S_0 + Σ_j [(f_j − f_{j−1−d})·δh_j − (b/nT) ‖δh_j‖²] − Σ_i f_i·δe_i
+          <= S_0 + Σ_j (nT/4b) ‖f_j − f_{j−1−d}‖² − Σ_i f_i·δe_i
+
+    In frequency, δe = (1 − w) f/C, and a sample of f is the mean of its n aliases; the
+    Cauchy-Schwarz inequality gives the condition. A part of a tick splits δh in two. Sums that end
+    at a tick N are those of a motion that goes on without end: e stays until the filter has died
+    away, then the spring is let go slowly. That adds −½K‖e_N‖² <= 0 to Σ f·δe, and no more.
 
     Args:
-        coupling: K, B' and their rotational counterparts; a ``CouplingGrid`` has many of them.
-        period: T in s, finite and > 0: duration for which the device holds a wrench.
+        coupling: K and B' in translation; a ``CouplingGrid`` has many, of either kind of axis.
+        period: T in s of the loop, finite and > 0.
         discretization: Rule that takes the damper's velocity from sampled positions.
-        delay: d, whole samples from position to force, 0 to 50.
+        delay: (d + φ) n in ticks from a sample to its force on the device, 0 to 50 n, whole or not.
         filter_time: τ in s, >= 0, of a first-order low-pass behind the damper, discretised by the
             same rule.
-        axis: Kind of axis, which selects the pair of K and B'.
+        ticks_per_sample: n, ticks from one sample of the device to the next, at least 1.
 
     Returns:
         The bound on b in N s/m (rotation: N m s/rad), shaped like the coupling. It is inf for
         Tustin's damper without low-pass at any delay, because its gain at Nyquist is infinite.
 
     Raises:
-        CouplingError: An argument is out of range, or the axis or discretization is unknown.
+        CouplingError: An argument is out of range, or the discretization is unknown.
 
     References:
-        Brown & Colgate 1997, eqs. (6), (7); Colgate & Schenkel 1997 (wall).
+        Brown & Colgate 1997, eqs. (2), (6), (7), for a device in time.
     """
-    law = SampledLaw.validated(coupling, period, discretization, delay, filter_time, axis)
-    stiffness, damping, period, delay, filter_time, unbounded = law
-    if delay:
-        # without low-pass, Tustin's bound is finite only for B' = 0, where both rules agree
-        rule: Discretization = "backward" if unbounded else discretization
-        needed, _ = wall_supremum(stiffness, damping, period, rule, delay, filter_time)
+    n = whole("ticks per sample", ticks_per_sample, least=1)
+    law = SampledLaw.validated(coupling, period, discretization, delay, filter_time, n)
+    if law.delay == 0 and n == 1:
+        share = 1.0
+        if not law.rings:
+            step = law.period if discretization == "backward" else 0.0
+            share = law.period / (step + 2 * law.filter_time)
+        needed = law.stiffness * law.period / 2 + law.damping * share
     else:
-        if unbounded:
-            share = 1.0
-        elif discretization == "tustin":
-            share = period / (2 * filter_time)
-        else:
-            share = period / (period + 2 * filter_time)
-        needed = stiffness * period / 2 + damping * share
-    if unbounded:
-        needed = np.where(damping > 0, np.inf, needed)
+        needed, _ = supremum(_for_any_environment(law.finite, n), law.finite, n)
+    if law.rings:
+        needed = np.where(law.damping > 0, np.inf, needed)
     return plain(np.asarray(needed))
 
 
-ANGLES_PER_RIPPLE = 400
-"""Number of angles θ at which each ripple of a late device's spectrum is evaluated. The largest
-value is missed by a share of at most (π/400)² = 6e-5."""
-
-
-def late_minimum_damping(
-    stiffness: float,
-    damping: ArrayLike,
+def wall_damping(
+    coupling: Coupling | CouplingGrid,
     period: float,
-    delay: float = 0.0,
-    ticks_per_sample: int = 1,
+    *,
+    discretization: Discretization = "backward",
+    delay: int = 0,
+    filter_time: float = 0.0,
 ) -> float | NDArray[np.float64]:
-    """Returns the device damping with which a coupling is passive behind a device that is late.
+    """Returns the least device damping with which a coupling is passive against a wall.
 
-    The device gives a new sample every n ticks and holds one force until the next. That force acts
-    a time t_d = (d + φ) n T after its sample, d whole and 0 <= φ < 1. The tool gets its force at
-    once. With β = B'/T
+        b >= (T/2) Re{(1 − w) C w^d}/(1 − cos θ)  for 0 < θ <= π,    w = e^{−jθ}
+        backward     b >= (K T/2) sin((2d + 1)θ/2)/sin(θ/2) − B' cos((d + 1)θ)
+        B' = 0       b >= K (T/2 + d T)
 
-        b >= n T max_θ [(1 − φ) sin²((d + 1)θ/2) + φ sin²((d + 2)θ/2)]
-                       · [n K²/(4 sin²(θ/2)) + K β + β²] / (K/2 + β),    0 < θ <= π
-
-    without delay   b >= n T [(n − 1) K² + y²]/(2y),    y = K + 2 B'/T
-    B' = 0, n = 1   b >= K T/2 (1 + d)² for a whole number of ticks
-
-    The returned bound is the larger one for t_d and for its whole part, and so holds for every
-    constant delay up to t_d: a part of a tick may ask less of a damper than none.
-
-    It is sufficient for every passive hand and every discrete-time passive scene, and necessary for
-    a spring alone. A sample that comes sooner needs less.
-
-    **Derivation.** The handle moves in one of n ticks. By (12) and the stored energy of the spring,
-    the hand gets at most
-
-        E <= S_0 + V_0 + Σ_j (f_j − f_{j−1−d})·δh_j − (b/nT) ‖δh_j‖² − Σ_i (K/2 + β) ‖δe_i‖²
-
-    with j over samples and i over ticks. f_j − f_{j−1−d} is K times the sum of the δe_i between
-    them plus β (δe_j − δe_{j−1−d}): a row of n filters. Its squared gain at θ is the bracket above
-    times 4 sin²((d + 1)θ/2), and E <= S_0 + V_0 where that is at most 4 (K/2 + β) b/(nT).
-
-    Args:
-        stiffness: K of the law in N/m, finite and > 0.
-        damping: B' of the law in N s/m, finite and >= 0; an array has many.
-        period: T of the loop in s, finite and > 0.
-        delay: t_d in s, 0 to 50 n T.
-        ticks_per_sample: n, at least 1.
-
-    Returns:
-        The bound on b in N s/m, shaped like the damping; units of rotation alike.
-
-    Raises:
-        CouplingError: An argument is out of range.
+    The tool does not move. The bound is necessary and sufficient for any passive hand, and with a
+    delay **too low for a tool that moves**: ``minimum_damping`` has the bound for every scene.
+    Arguments and errors are those of ``minimum_damping``, with d a whole number of ticks, 0 to 50.
 
     References:
-        Brown & Colgate 1997, eq. (6), for n = 1 without delay.
+        Colgate & Schenkel 1997.
     """
-    k = scalar("coupling stiffness", stiffness, "N/m", positive=True)
-    law_damping = checked("coupling damping", damping, "N s/m")
-    period = scalar("period", period, "s", positive=True)
-    n = whole("ticks per sample", ticks_per_sample, least=1)
-    delayed = scalar("delay", delay, "s") / (n * period)
-    if delayed > MAX_DELAY:
-        raise CouplingError(f"delay is {delay:g} s; it must be at most {MAX_DELAY * n * period:g}")
-    samples = int(delayed + SAME)
-    part = max(delayed - samples, 0.0)
-    theta = np.linspace(0.0, np.pi, ANGLES_PER_RIPPLE * (samples + 2) + 1)
-    theta[0] = LOWEST_ANGLE
-    ripples = np.sin(0.5 * np.outer([samples + 1, samples + 2], theta)) ** 2
-    lag = np.array([[1.0, 0.0], [1.0 - part, part]]) @ ripples  # of the whole part, and of t_d
-    slow = lag / np.sin(0.5 * theta) ** 2
-    beta = law_damping / period
-    # one by one: all at once would hold every ratio at every angle, 133 MB at a delay of 50 samples
-    gain = [(0.25 * n * k**2 * slow + (k * each + each**2) * lag).max() for each in beta.flat]
-    needed = n * period * np.reshape(gain, beta.shape) / (0.5 * k + beta)
+    samples = delayed_by(delay)
+    law = SampledLaw.validated(coupling, period, discretization, samples, filter_time)
+    needed, _ = wall_supremum(law.finite)
+    if law.rings:
+        needed = np.where(law.damping > 0, np.inf, needed)
     return plain(np.asarray(needed))
 
 
@@ -307,13 +273,15 @@ def stiffest_late_coupling(
 
     It is the stiffest one that needs ``NEEDED_SHARE`` of b, with B' of at least b/(4 n). For a
     device in time that is ``stiffest_coupling`` within 1 %. Behind a delay the stiffest one has
-    more damping, because the damper lowers the need at low frequencies. Arguments and errors are
-    those of ``late_minimum_damping``; b in N s/m must be finite and > 0.
+    more damping, because the damper lowers the need at low frequencies. The delay is in s; other
+    arguments and errors are those of ``minimum_damping``. b in N s/m must be finite and > 0.
     """
     b = scalar("device damping", device_damping, "N s/m", positive=True)
     largest = 1.0 + ticks_per_sample**0.5 + delay / period
     ratios = np.linspace(0.0, largest, RATIOS) * period  # B'/K in s
-    needed = late_minimum_damping(1.0, ratios, period, delay, ticks_per_sample)
+    laws = CouplingGrid(1.0, ratios)
+    ticks = delay / period
+    needed = minimum_damping(laws, period, delay=ticks, ticks_per_sample=ticks_per_sample)
     stiffness = NEEDED_SHARE * b / np.asarray(needed)
     is_damped = ratios * stiffness >= DAMPING_SHARE * b / ticks_per_sample * (1.0 - SAME)
     best = int(np.argmax(np.where(is_damped, stiffness, 0.0)))

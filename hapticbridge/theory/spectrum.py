@@ -7,6 +7,7 @@ frequency.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -17,11 +18,12 @@ from hapticbridge.arguments import LARGEST, shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
 from hapticbridge.theory.transfer import (
+    ROUNDING,
     CouplingGrid,
     Discretization,
     SampledLaw,
     angles,
-    coupling_transfer,
+    late_by,
     plain,
     scalar,
 )
@@ -61,55 +63,83 @@ def needed_for_fixed_environment(
     return needed
 
 
+def needed_behind_delay(
+    transfer: Callable[[NDArray[np.float64]], NDArray[np.complex128]],
+    period: float,
+    theta: NDArray[np.float64],
+    delay: float,
+    count: int = 1,
+) -> NDArray[np.float64]:
+    """Returns the requirement for any environment of a device that is late, in N s/m.
+
+        max{ s_d, (1 − φ) s_d + φ s_{d+1} } Σ_i b(ψ_i)/sin²(ψ_i/2),    s_d = sin²((d + 1)θ/2)
+
+    b(ψ) is that of ``needed_for_any_environment`` at ψ_i = (θ + 2πi)/n, i = 0 … n − 1. The force
+    acts (d + φ) n T after its sample, d whole and 0 <= φ < 1, and is held for n T.
+
+    Args:
+        transfer: C in N/m as a function of ψ in rad.
+        period: T in s.
+        theta: θ in rad per sample.
+        delay: d + φ in samples.
+        count: n in ticks per sample.
+    """
+    samples = int(delay + ROUNDING)
+    part = max(delay - samples, 0.0)
+    first, second = (np.sin(0.5 * (samples + i) * theta) ** 2 for i in (1, 2))
+    lag = np.maximum(first, (1.0 - part) * first + part * second)
+    total: NDArray[np.float64] = np.zeros(())
+    for i in range(count):
+        psi = (theta + 2.0 * np.pi * i) / count
+        needed = needed_for_any_environment(transfer(psi), period, psi)
+        total = total + needed / np.sin(0.5 * psi) ** 2
+    needed_late: NDArray[np.float64] = lag * total
+    return needed_late
+
+
 def damping_spectrum(
     coupling: Coupling | CouplingGrid,
     period: float,
     frequency: ArrayLike,
     *,
     discretization: Discretization = "backward",
-    delay: int = 0,
+    delay: float = 0.0,
     filter_time: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Returns the device damping that a coupling requires at each frequency.
+    """Returns the device damping that a coupling requires at each frequency, for any environment.
 
-        delay = 0:   b(ω) = (T/2)(1 − cos ωT) / Re{(1 − e^{−jωT}) / C}        any environment
-        delay = d:   b(ω) = (T/2) Re{(1 − e^{−jωT}) C e^{−jdωT}} / (1 − cos ωT)        a wall
+        b(ω) = (T/2) [1 − cos((d + 1) ωT)] / Re{(1 − e^{−jωT}) / C(e^{jωT})}
 
-    ``minimum_damping`` is the supremum over 0 < ω <= π/T; its arguments and errors apply here. With
-    a delay the environment is a wall; ``late_minimum_damping`` has the bound for any environment.
-    Against a wall the coupling's damper can help, so values may be negative.
+    ``minimum_damping`` is the supremum over 0 < ω <= π/T; its arguments and errors apply here, as
+    does its form for a part of a tick. For a wall, ``SampledLoop.damping_spectrum`` has it.
 
     Returns:
         b in N s/m, shape S + F for couplings of shape S and frequencies ω in
         rad/s of shape F; inf where none suffices.
 
     References:
-        Brown & Colgate 1997, eqs. (2), (4), (5); Colgate & Schenkel 1997.
+        Brown & Colgate 1997, eqs. (2), (4), (5), for d = 0.
     """
     law = SampledLaw.validated(coupling, period, discretization, delay, filter_time)
-    period, delay, filter_time = law.period, law.delay, law.filter_time
-    theta = angles(frequency, period)
-    stiffness, damping = (
-        value.reshape(value.shape + (1,) * theta.ndim) for value in (law.stiffness, law.damping)
-    )
-    transfer = coupling_transfer(stiffness, damping, period, theta, discretization, filter_time)
-    if delay:
-        return needed_for_fixed_environment(transfer * np.exp(-1j * delay * theta), period, theta)
-    needed = needed_for_any_environment(transfer, period, theta)
+    theta = angles(frequency, law.period)
+    theta = theta.reshape((1,) * law.stiffness.ndim + theta.shape)
+    needed = needed_behind_delay(law.transfer, law.period, theta, law.delay)
     if law.rings:
         # tan(π/2) is finite in floating point; the limit at Nyquist is not
-        needed = np.where((theta == np.pi) & (damping > 0), np.inf, needed)
+        is_damped = law.damping.reshape(law.damping.shape + (1,) * (theta.ndim - law.damping.ndim))
+        needed = np.where((theta == np.pi) & (is_damped > 0), np.inf, needed)
     return needed
 
 
 def damping_spectrum_of(
-    transfer: Transfer, period: float, frequency: ArrayLike
+    transfer: Transfer, period: float, frequency: ArrayLike, *, delay: float = 0.0
 ) -> float | NDArray[np.float64]:
     """Returns the device damping that any coupling requires at each frequency.
 
-        b(ω) = (T/2)(1 − cos ωT) / Re{(1 − e^{−jωT}) / C(e^{jωT})}
+        b(ω) = (T/2) [1 − cos((d + 1) ωT)] / Re{(1 − e^{−jωT}) / C(e^{jωT})}
 
-    The result holds for every passive hand and every discrete-time passive environment.
+    The result holds for every passive hand and every discrete-time passive environment, if C is
+    stable but for the pole of its spring at z = 1, and C(1) is not negative.
 
     Args:
         transfer: C from h − x in m to the force on the tool in N: a function of an array of
@@ -117,6 +147,7 @@ def damping_spectrum_of(
             z)``.
         period: T in s, finite and > 0.
         frequency: ω in rad/s, 0 < ω <= π/T, any shape.
+        delay: d in ticks from a sample to its force on the device, as for ``minimum_damping``.
 
     Returns:
         b in N s/m, shaped like the frequency; inf where no damping suffices.
@@ -125,9 +156,10 @@ def damping_spectrum_of(
         CouplingError: An argument is out of range, or C is not finite at a frequency.
 
     References:
-        Brown & Colgate 1997, eq. (2).
+        Brown & Colgate 1997, eq. (2), for d = 0.
     """
     period = scalar("period", period, "s", positive=True)
+    delay = late_by(delay)
     theta = angles(frequency, period)
     if not callable(transfer):
         raise CouplingError(f"transfer is {shown(transfer)}; it must be a callable of z")
@@ -145,10 +177,10 @@ def damping_spectrum_of(
         )
     if not (np.abs(response) <= LARGEST**2).all():
         raise CouplingError("the transfer function is not finite at one of the frequencies")
-    return plain(needed_for_any_environment(response, period, theta))
+    return plain(needed_behind_delay(lambda _: response, period, theta, delay))
 
 
-# Supremum over frequency of the damping that a delayed coupling requires against a wall
+# Supremum over frequency of the damping that a delayed coupling requires
 
 _Array = NDArray[np.float64]
 
@@ -174,43 +206,47 @@ negligible."""
 _RATIO = (np.sqrt(5) - 1) / 2
 
 
-def wall_supremum(
-    stiffness: _Array,
-    damping: _Array,
-    period: float,
-    scheme: Discretization,
-    delay: int,
-    filter_time: float,
-) -> tuple[_Array, _Array]:
+def wall_supremum(law: SampledLaw) -> tuple[_Array, _Array]:
     """Returns the supremum over 0 < θ <= π of (T/2) Re{(1 − e^{−jθ}) C e^{−jdθ}} / (1 − cos θ).
 
+    The discretization must be finite at Nyquist, and the delay whole. Results are those of
+    ``supremum``.
+    """
+
+    def needed(theta: _Array) -> _Array:
+        delayed = law.transfer(theta) * np.exp(-1j * law.delay * theta)
+        return needed_for_fixed_environment(delayed, law.period, theta)
+
+    return supremum(needed, law, 1)
+
+
+def supremum(
+    needed: Callable[[_Array], _Array], law: SampledLaw, count: int
+) -> tuple[_Array, _Array]:
+    """Returns the supremum of a spectrum over 0 < θ <= π, for each coupling of a law.
+
     The grid is even in θ and, with a low-pass, also in log θ down to its corner. The best cell of
-    every half ripple is refined by golden section, because ripples can be equally high. The
-    discretization (``scheme``) must be finite at Nyquist.
+    every half ripple is refined by golden section, because ripples can be equally high.
+
+    Args:
+        needed: The spectrum, of θ with the axes of the coupling and further ones.
+        law: The law; its shape, delay and low-pass count.
+        count: n in ticks per sample.
 
     Returns:
         The supremum in N s/m, and the θ in rad of its first occurrence, to about 1e-7.
     """
-    grid = search_grid(delay, filter_time / period)
+    shape, held = law.stiffness.shape, count * law.period
+    samples = math.ceil(law.delay / count - ROUNDING)
+    grid = search_grid(samples, law.filter_time / held)
     # indices of the points of each segment; neighbouring segments share their ends
     firsts = np.arange(0, grid.size - 1, POINTS_PER_SEGMENT)
     points = np.minimum(firsts[:, None] + np.arange(POINTS_PER_SEGMENT + 1), grid.size - 1)
-    batch = max(1, BATCH // max(1, stiffness.size * points.shape[1]))
-    # one axis for the segments of a batch
-    k, b = stiffness[..., None], damping[..., None]
-
-    def needed(theta: _Array) -> _Array:
-        more = (1,) * (theta.ndim - k.ndim)
-        transfer = coupling_transfer(
-            k.reshape(k.shape + more), b.reshape(b.shape + more), period, theta, scheme, filter_time
-        )
-        delayed = transfer * np.exp(-1j * delay * theta)
-        return needed_for_fixed_environment(delayed, period, theta)
-
-    best = np.full(stiffness.shape, -np.inf)
-    place = np.full(stiffness.shape, grid[0])
+    batch = max(1, BATCH // max(1, law.stiffness.size * points.shape[1]))
+    best = np.full(shape, -np.inf)
+    place = np.full(shape, grid[0])
     for first in range(0, len(points), batch):
-        values, angles = _refined(needed, grid, points[first : first + batch], k.shape[:-1])
+        values, angles = _refined(needed, grid, points[first : first + batch], shape)
         highest = values.argmax(axis=-1)[..., None]
         value, angle = (
             np.take_along_axis(array, highest, -1)[..., 0] for array in (values, angles)

@@ -15,15 +15,16 @@ from hapticbridge.errors import CouplingError
 
 # Arrays of couplings, and argument checks shared by all bounds
 
-Axis = Literal["translation", "rotation"]
-"""Kind of axis; it selects the pair of K and B."""
-
 MAX_DELAY = 50
 """Largest delay in samples: 50 ms at 1 kHz, where a coupling is too soft to be useful. The time to
 compute a bound grows with its square."""
 
 MAX_SAMPLES = 10**8
 """Largest length of a run or series in samples: a day at 1 kHz, which still fits into memory."""
+
+ROUNDING = 1e-9
+"""Rounding of a delay in ticks, without unit: delays in s are divided by periods in s. A delay that
+falls short of a whole number by less counts as it."""
 
 _ARGUMENTS = Arguments(CouplingError)
 # a frequency is an angle divided by a period, so its range is squared
@@ -53,8 +54,14 @@ def whole(name: str, value: int, least: int = 0, most: int = MAX_SAMPLES) -> int
 
 
 def delayed_by(value: int) -> int:
-    """Returns a delay of 0 to ``MAX_DELAY`` samples, or raises CouplingError."""
+    """Returns a delay of 0 to ``MAX_DELAY`` whole samples, or raises CouplingError."""
     return whole("delay", value, most=MAX_DELAY)
+
+
+def late_by(value: float, count: int = 1) -> float:
+    """Returns a delay of 0 to ``MAX_DELAY`` times n (``count``) ticks, or raises CouplingError."""
+    most = MAX_DELAY * count * (1 + ROUNDING)
+    return _ARGUMENTS.number("delay", value, "ticks", least=0, most=most)
 
 
 def one_of(name: str, value: str, valid: Iterable[str]) -> str:
@@ -103,19 +110,14 @@ class CouplingGrid:
         together(**arrays)
 
 
-_OF_ROTATION = ("rotational_stiffness", "rotational_damping")
-
-
 def spring_and_damper(
-    coupling: Coupling | CouplingGrid, axis: Axis = "translation"
+    coupling: Coupling | CouplingGrid,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns K and B of one kind of axis, or of a grid, broadcast to one shape.
+    """Returns K and B in translation, or of a grid, broadcast to one shape.
 
     Raises:
-        CouplingError: The axis is unknown, the coupling has a wrong type, or a value is out of
-            range.
+        CouplingError: The coupling has a wrong type, or a value is out of range.
     """
-    is_translation = one_of("axis", axis, ("translation", "rotation")) == "translation"
     if isinstance(coupling, CouplingGrid):
         arrays = {field.name: getattr(coupling, field.name) for field in fields(coupling)}
         stiffness, damping = together(**arrays)
@@ -124,13 +126,11 @@ def spring_and_damper(
         raise CouplingError(
             f"coupling is {shown(coupling)}; it must be a Coupling or a CouplingGrid"
         )
-    names = ("stiffness", "damping") if is_translation else _OF_ROTATION
     # Coupling has no upper limit and accepts fractions.Fraction, so convert and check here
-    stiffness, damping = (
-        checked(f"coupling {name}", float(getattr(coupling, name)), positive=is_first)
-        for name, is_first in zip(names, (is_translation, False), strict=True)
+    return (
+        checked("coupling stiffness", float(coupling.stiffness), positive=True),
+        checked("coupling damping", float(coupling.damping)),
     )
-    return stiffness, damping
 
 
 def single(coupling: Coupling) -> tuple[float, float]:
@@ -217,17 +217,17 @@ class SampledLaw(NamedTuple):
         stiffness: K in N/m, shaped like the coupling.
         damping: B in N s/m, shaped like the coupling.
         period: T in s.
-        delay: d in samples.
+        delay: d in ticks.
         filter_time: τ in s.
-        rings: True for Tustin's damper without low-pass, whose gain is infinite at Nyquist.
+        discretization: Rule for the damper and its filter.
     """
 
     stiffness: NDArray[np.float64]
     damping: NDArray[np.float64]
     period: float
-    delay: int
+    delay: float
     filter_time: float
-    rings: bool
+    discretization: Discretization
 
     @classmethod
     def validated(
@@ -235,22 +235,37 @@ class SampledLaw(NamedTuple):
         coupling: Coupling | CouplingGrid,
         period: float,
         discretization: Discretization,
-        delay: int,
+        delay: float,
         filter_time: float,
-        axis: Axis = "translation",
+        count: int = 1,
     ) -> SampledLaw:
-        """Validates the arguments of a bound.
+        """Validates the arguments of a bound for n (``count``) ticks per sample.
 
         Raises:
-            CouplingError: An argument is out of range, or the axis or discretization is unknown.
+            CouplingError: An argument is out of range, or the discretization is unknown.
         """
         period = scalar("period", period, "s", positive=True)
         filter_time = scalar("filter time", filter_time, "s")
-        delay = delayed_by(delay)
-        stiffness, damping = spring_and_damper(coupling, axis)
+        delay = late_by(delay, count)
+        stiffness, damping = spring_and_damper(coupling)
         one_of("discretization", discretization, DISCRETIZATIONS)
-        rings = discretization == "tustin" and filter_time == 0
-        return cls(stiffness, damping, period, delay, filter_time, rings)
+        return cls(stiffness, damping, period, delay, filter_time, discretization)
+
+    @property
+    def rings(self) -> bool:
+        """True for Tustin's damper without low-pass, whose gain is infinite at Nyquist."""
+        return self.discretization == "tustin" and self.filter_time == 0
+
+    @property
+    def finite(self) -> SampledLaw:
+        """The law by the backward difference if it rings: equal for B = 0, finite for B > 0."""
+        return self._replace(discretization="backward") if self.rings else self
+
+    def transfer(self, theta: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Returns C at angles θ in rad, whose axes are those of the coupling and further ones."""
+        more = (1,) * (theta.ndim - self.stiffness.ndim)
+        k, b = (value.reshape(value.shape + more) for value in (self.stiffness, self.damping))
+        return coupling_transfer(k, b, self.period, theta, self.discretization, self.filter_time)
 
 
 # Lossless transmission line in place of the spring and damper.

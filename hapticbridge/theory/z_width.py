@@ -27,10 +27,19 @@ from hapticbridge.theory.bounds import (
     DAMPING_SHARE,
     NEEDED_SHARE,
     STIFFNESS_MARGIN,
+    minimum_damping,
     stiffest_late_coupling,
 )
-from hapticbridge.theory.spectrum import wall_supremum
-from hapticbridge.theory.transfer import checked, delayed_by, plain, scalar, single, together, whole
+from hapticbridge.theory.transfer import (
+    CouplingGrid,
+    checked,
+    delayed_by,
+    plain,
+    scalar,
+    single,
+    together,
+    whole,
+)
 
 # Stiffness limits from position resolution and Coulomb friction
 
@@ -287,7 +296,7 @@ def free_device_damping(
 # Line of passivity in the plane of K and B
 
 SECANTS, SETTLED = 60, 1e-13
-"""Largest number of secant steps towards the line against a wall, and relative step in K at which
+"""Largest number of secant steps towards the line of a late device, and relative step in K at which
 they end. About ten steps are taken. The step equals the resolution of the bound. Both without
 unit."""
 
@@ -302,7 +311,7 @@ class PassiveLine:
     Attributes:
         b: Device damping in N s/m, > 0.
         period: T in s, > 0.
-        delay: d in samples; for d >= 1 the line is that against a wall.
+        delay: d in samples.
         filter_time: τ in s, >= 0.
     """
 
@@ -317,13 +326,14 @@ class PassiveLine:
         return self.period / (self.period + 2 * self.filter_time)
 
     def stiffness(self, damping: _Array) -> _Array:
-        """Returns the largest K in N/m for any hand; with a delay, against a wall."""
+        """Returns the largest K in N/m for any hand and in every scene."""
         if self.delay == 0:
             return np.maximum(0.0, 2 * (self.b - self.share * damping) / self.period)
-        # The damping that a wall requires is convex in K, so secants from above never cross the
-        # line. They start above it, because at ω → 0 a wall already requires (d + ½) K T − B.
-        soft = SOFT * self.b / self.period
-        before, last = ((self.b + damping) / (self.period * self.delay) * x for x in (1.1, 1.0))
+        # The requirement is convex in K, so secants from above never cross the line. They start
+        # where ω → 0 alone requires b: (d + 1)² K² T/2 = b (K + 2B/T).
+        soft, share = SOFT * self.b / self.period, (self.delay + 1) ** 2
+        root = np.sqrt(self.b + 4 * share * damping) * np.sqrt(self.b)
+        before, last = ((self.b + root) / (self.period * share) * x for x in (1.1, 1.0))
         needed_before = self._needed(before, damping)
         for _ in range(SECANTS):
             needed = self._needed(last, damping)
@@ -342,16 +352,13 @@ class PassiveLine:
         return float(self.b / self._needed(np.full(1, SOFT / self.period), np.ones(1))[0])
 
     def _needed(self, stiffness: _Array, damping: _Array) -> _Array:
-        return wall_supremum(
-            stiffness, damping, self.period, "backward", self.delay, self.filter_time
-        )[0]
+        laws, late, low_pass = CouplingGrid(stiffness, damping), self.delay, self.filter_time
+        return np.asarray(minimum_damping(laws, self.period, delay=late, filter_time=low_pass))
 
 
 _Array = NDArray[np.float64]
 
 ANY_HAND = "passive for any hand"
-WALL = "passive against a wall"
-BEHIND_DELAY = "passive for any hand behind the delay"
 NO_LIMIT_CYCLES = "free of limit cycles"
 WITHOUT_HAND = "stable without a hand"
 
@@ -368,7 +375,6 @@ MARGIN_OF_RANGE = 1.25
 region that is not passive."""
 
 _CYCLES = "limit cycles, which stay bounded as long as K < 2b/T"
-_DELAYED = "with a delay the lines are those of a wall; the coupling to use holds for every scene"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -403,7 +409,7 @@ class ZWidth:
         corner: Recommended coupling in translation (rotational part 0). B is a quarter of the limit
             at K → 0, K is 80 % of the limit at that B. With a delay it is that of
             ``bounds.stiffest_late_coupling``.
-        corner_limited_by: Name of the line above the corner, or of the bound behind a delay.
+        corner_limited_by: Name of the line above the corner.
         notes: Sentences about effects that the lines do not cover.
         device_damping: b in N s/m.
         period: T in s.
@@ -443,23 +449,21 @@ def z_width(
 ) -> ZWidth:
     """Returns the couplings (K, B) that a device can render, and a recommended one.
 
-        passive for any hand     K = 2(b − B T/(T + 2τ))/T              d = 0
-        passive against a wall   minimum_damping(K, B, delay=d) = b     d >= 1
-        free of limit cycles     K = 2(f_c/Δ − B/T)                     Δ > 0
-        stable without a hand    ``free_device_stiffness``              m_d known
+        passive for any hand     ``minimum_damping`` = b;  d = 0: K = 2(b − B T/(T + 2τ))/T
+        free of limit cycles     K = 2(f_c/Δ − B/T)              Δ > 0
+        stable without a hand    ``free_device_stiffness``       m_d known
 
-    Without a delay the first line is sufficient for any passive hand and any environment that is
-    discrete-time passive. With a delay the line against a wall is necessary but not sufficient for
-    a general environment. The recommended coupling then needs 85 % of b by the bound that suffices,
-    ``bounds.late_minimum_damping``; it has no low-pass.
+    The first line is necessary, and sufficient for any passive hand and any environment that is
+    discrete-time passive. With a delay the recommended coupling needs 85 % of b; it is not that of
+    a low-pass.
 
     The friction line holds for a loop without delay and low-pass; a low-pass makes the damper's
     jumps smaller. It is required only if f_c T/Δ reaches ``MIN_FRICTION_SHARE`` of b. Otherwise a
     note announces limit cycles, which stay bounded while β = b/(K T) > ½, that is below the first
     line.
 
-    A coupling that is passive against a wall is stable without a hand, so the last line lies above
-    the first one. If rounding puts the line of a very heavy device below it, the first line is
+    A coupling that is passive for any hand is stable without one, so the last line lies above the
+    first one. If rounding puts the line of a very heavy device below it, the first line is
     used.
 
     Args:
@@ -476,8 +480,8 @@ def z_width(
         CouplingError: An argument is out of range.
 
     References:
-        Brown & Colgate 1997, eq. (6); Colgate & Schenkel 1997 (wall); Abbott & Okamura 2005
-        (friction); Diolaiti et al. 2006 (limit cycles); Colgate & Brown 1994 (Z-width).
+        Brown & Colgate 1997, eq. (6); Abbott & Okamura 2005 (friction); Diolaiti et al. 2006 (limit
+        cycles); Colgate & Brown 1994 (Z-width).
     """
     loop = PassiveLine(
         scalar("device damping", device_damping, "N s/m", positive=True),
@@ -515,7 +519,7 @@ def z_width(
         needed = 0.5 * stiff * loop.period + damped  # of f_c T/Δ
         share = min(NEEDED_SHARE * allowed / needed, 1.0) if allowed and is_kept else 1.0
         corner = share * stiff, share * damped
-        limited_by = BEHIND_DELAY if share == 1.0 else NO_LIMIT_CYCLES
+        limited_by = ANY_HAND if share == 1.0 else NO_LIMIT_CYCLES
     return ZWidth(
         damping=grid,
         lines=tuple(replace(line, stiffness=line.stiffness[:-1]) for line in lines),
@@ -523,7 +527,7 @@ def z_width(
         limited_by=tuple(required[index].name for index in least[:-1]),
         corner=Coupling(*corner, 0.0, 0.0),
         corner_limited_by=limited_by,
-        notes=tuple(note for note in (_DELAYED if delay else "", of_friction) if note),
+        notes=(of_friction,) if of_friction else (),
         device_damping=loop.b,
         period=period,
         delay=delay,
@@ -536,10 +540,9 @@ def z_width(
 
 def _passive_line(loop: PassiveLine, damping: _Array, largest: float) -> LimitLine:
     reason = "b > K T/2 + B_law T/(T + 2τ)" if loop.filter_time else "b > K T/2 + B_law"
-    name = ANY_HAND
     if loop.delay:
-        name, reason = WALL, "at the worst frequency"
-    return LimitLine(name, reason, loop.stiffness(damping), largest, is_required=True)
+        reason = "behind the delay, at the worst frequency"
+    return LimitLine(ANY_HAND, reason, loop.stiffness(damping), largest, is_required=True)
 
 
 def _free_line(loop: PassiveLine, mass: float, damping: _Array, passive: LimitLine) -> LimitLine:

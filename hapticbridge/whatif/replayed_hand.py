@@ -442,7 +442,7 @@ class Repetition:
         """Returns the change to an equal effective coupling under these settings."""
         hand = self._hand_of(event)
         old, new = self._hands[hand].settings, self._settings[hand]
-        period = 1.0 / self.settings.options.rate
+        period = 1.0 / self.settings.options.loop_rate
         if new.loop == old.loop:
             return event
         law = coupling_in(event, self._hands[hand].parameters)

@@ -77,7 +77,8 @@ class Settings:
             method=setup.method.name,
             contact=setup.method.contact,
             substeps=setup.substeps,
-            scene_rate=request.options.rate / max(setup.scene_ticks, 1),
+            rate=request.options.loop_rate,
+            scene_rate=request.options.loop_rate / max(setup.scene_ticks, 1),
             contact_stiffness=setup.contact_stiffness or None,
             workspace=setup.workspace,
             limits=setup.limits,
@@ -93,17 +94,17 @@ class Settings:
     def timestep(self) -> float:
         """MuJoCo's h in s."""
         ticks = max(self.options.scene_ticks, 1)
-        return ticks / (self.options.rate * (self.options.substeps or 1))
+        return ticks / (self.options.loop_rate * (self.options.substeps or 1))
 
     @property
     def loop(self) -> tuple[object, ...]:
         """Settings on which the effective coupling depends."""
-        return self.coupling, self.method, self.options.rate, self.timestep
+        return self.coupling, self.method, self.options.loop_rate, self.timestep
 
     @property
     def steps_per_second(self) -> float:
         """MuJoCo's steps per second of a scene that steps in every tick."""
-        return self.options.rate * (self.options.substeps or 1)
+        return self.options.loop_rate * (self.options.substeps or 1)
 
     def value(self, name: str) -> Value | None:
         """Returns the value of a setting or scene parameter."""
@@ -149,7 +150,7 @@ class Settings:
         if "contact" not in new and self.method.is_rigid and not method.can_be_rigid:
             new["contact"] = None
         if options.scene_ticks == 0:
-            new.setdefault("scene_rate", new.get("rate", options.rate))
+            new.setdefault("scene_rate", new.get("rate", options.loop_rate))
         if method.has_coupling:
             new.setdefault("contact_stiffness", None)
         new["workspace"] = replace(workspace, **own[Workspace])

@@ -306,7 +306,7 @@ class _Experiment:
 
     def _prescribed(self, settings: Sequence[Settings]) -> WhatIfRun:
         run = self.run
-        if settings[0].options.rate == run.settings.options.rate:
+        if settings[0].options.loop_rate == run.settings.options.loop_rate:
             clock = RecordedClock(run.ticks, run.period)
             devices: list[Device] = [RecordedMotion(hand, clock) for hand in self.hands]
             return self._simulated(PRESCRIBED, lambda _: devices, clock, settings)
@@ -400,7 +400,7 @@ def _missing_parts(run: RecordedRun, repetition: Repetition) -> Iterator[str]:
     if counts["reset"] and not repetition.keeps_resets:
         yield f"{counts['reset']} resets in the recorded run, none here: there is nothing to reset"
     flags = run.recording.ticks["flags"]
-    is_resampled = repetition.settings.options.rate != run.settings.options.rate
+    is_resampled = repetition.settings.options.loop_rate != run.settings.options.loop_rate
     if missed := int(np.count_nonzero(flags & int(TickFlag.OVERRUN))):
         here = "none in these runs" if is_resampled else "none in the closed loop"
         yield (

@@ -62,7 +62,7 @@ def measure(options: argparse.Namespace) -> dict[str, float]:
         for copy in files:
             shutil.copyfile(paths[lengths[0]], copy)
         start = time.perf_counter()
-        audit_all(files, jobs=options.jobs)
+        audit_all(files, workers=options.jobs)
         many = time.perf_counter() - start
     medians = {f"{length:g} s": np.median(each, axis=0) for length, each in found.items()}
     for length, (took, peak) in medians.items():

@@ -21,7 +21,7 @@ def verdict(point: dict[str, Any]) -> dict[str, str]:
 
 if __name__ == "__main__":
     axes = {"stiffness": [1000.0, 2000.0, 4000.0], "mass": [0.05, 0.2]}
-    table = sweep(verdict, grid(method=["implicitfast", "lossless"], **axes), jobs=2)
+    table = sweep(verdict, grid(method=["implicitfast", "lossless"], **axes), workers=2)
     for row in range(len(table)):
         method, environment = (str(table.texts(name)[row]) for name in ("method", "environment"))
         stiffness, mass = (float(table.numbers(name)[row]) for name in axes)

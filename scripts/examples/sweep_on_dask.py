@@ -20,7 +20,7 @@ def dissipated(point: dict[str, Any]) -> dict[str, float]:
 if __name__ == "__main__":
     points = grid(clearance=[1e-4, 2e-4], friction=[0.2, 0.4])
     scheduler = sys.argv[1] if len(sys.argv) > 1 else None
-    table = sweep(dissipated, points, scheduler=scheduler)
+    table = sweep(dissipated, points, workers=scheduler)
     for clearance, friction, joules in zip(
         *(table.numbers(name) for name in ("clearance", "friction", "joules")), strict=True
     ):

@@ -204,12 +204,13 @@ def _slide(
     axis: Record,
     units_left: int,
     force: float,
-    stretch: float,
-    velocity: float,
+    motion: tuple[float, float],
     drift: float,
     direction: float,
 ) -> tuple[int, float, float, float]:
     """Slides in one direction until the velocity vanishes or the time ends.
+
+    ``motion`` is the stretch x − p and the velocity.
 
     A step is accepted if the velocity keeps its sign at its end and cannot have vanished in
     between. It can have if the acceleration changes from against the motion to along it. Otherwise
@@ -218,7 +219,7 @@ def _slide(
     Returns:
         Remaining time in units of T/2^40, distance travelled, new stretch x − p, new velocity.
     """
-    travel = 0.0
+    travel, (stretch, velocity) = 0.0, motion
     friction = direction * axis.friction
     level = axis.first_level
     is_bracketed = is_past_dip = False
@@ -291,7 +292,7 @@ def moved_with_friction(
                 stretch -= units * unit * drift
                 units_left -= units
         units_left, dx, stretch, velocity = _slide(
-            axis, units_left, force, stretch, velocity, drift, direction
+            axis, units_left, force, (stretch, velocity), drift, direction
         )
         travel += dx
     return travel, 0.0

@@ -31,7 +31,7 @@ from hapticbridge.run.options import DEFAULT_OPTIONS
 RATE = 1000.0
 """Rate of the loop in Hz that a recommendation is for: that of most devices."""
 
-DEFAULT = Setting(DEFAULT_OPTIONS.rendering_method, 1.0 / DEFAULT_OPTIONS.rate)
+DEFAULT = Setting(DEFAULT_OPTIONS.rendering_method, 1.0 / DEFAULT_OPTIONS.loop_rate)
 """Setting of ``hapticbridge run`` without options."""
 
 JND = 1.0

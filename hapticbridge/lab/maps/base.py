@@ -9,7 +9,6 @@ import re
 import tempfile
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,7 @@ from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import write_picture
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.load import scene_path
-from hapticbridge.sweep import Table, check_format, sweep
+from hapticbridge.sweep import Table, Workers, check_format, sweep
 from hapticbridge.theory.bounds import maximum_stiffness
 
 Point = dict[str, float | int | str | bool]
@@ -157,8 +156,7 @@ def run_map(
     *,
     points: int | None = None,
     form: str = "csv",
-    executor: Executor | None = None,
-    scheduler: str | None = None,
+    workers: Workers = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> MapFiles:
     """Computes a map and writes its picture, table, boundary and the recordings of its twins.
@@ -171,8 +169,7 @@ def run_map(
         folder: Folder to write into; made if missing.
         points: Approximate number, 4 to 1 000 000; None for the map's own number.
         form: Format of the table: ``csv`` or ``parquet`` (needs the extra ``tables``).
-        executor: Executor for the points; by default a pool of processes.
-        scheduler: Address of a dask.distributed cluster instead.
+        workers: As for ``sweep``.
         progress: Called with the points done and all points.
 
     Raises:
@@ -191,8 +188,7 @@ def run_map(
         stability_map.evaluate,
         stability_map.points(points or stability_map.default_points),
         results=folder / f"{name}.parts",
-        executor=executor,
-        scheduler=scheduler,
+        workers=workers,
         progress=progress,
     )
     table.write(files[form])  # the table first: computing it took the time

@@ -28,7 +28,7 @@ from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep import Table
-from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
+from hapticbridge.theory.bounds import maximum_stiffness, wall_damping
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
 THEORY_WIDTH = base.WIDTH / 100
@@ -248,7 +248,7 @@ def _run(
 
 
 def wall_limit(name: str, period: float, delay: int) -> float:
-    """Returns the largest K in N/m on a wall for any hand: ``minimum_damping`` solved for K.
+    """Returns the largest K in N/m on a wall for any hand: ``wall_damping`` solved for K.
 
     Args:
         name: The method, whose law uses B' where ``DAMPING`` is requested.
@@ -262,7 +262,7 @@ def wall_limit(name: str, period: float, delay: int) -> float:
     def is_enough(stiffness: float) -> bool:
         coupling = Coupling(stiffness, DAMPING, 0.0, 0.0)
         used = METHODS[name].law_coupling(coupling, period)
-        return minimum_damping(used, period, delay=delay) < DEVICE_DAMPING
+        return bool(wall_damping(used, period, delay=delay) < DEVICE_DAMPING)
 
     return base.largest_stable(is_enough, *SEARCHED, THEORY_WIDTH).middle
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 
@@ -11,16 +12,23 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.lab.paper.in_mujoco import HEAVY, ImplicitMass, decays, hold, wall_limit
+from hapticbridge.lab.paper.in_mujoco import (
+    HEAVY,
+    ImplicitMass,
+    decays,
+    hold,
+    limit_of,
+    wall_limit,
+)
 from hapticbridge.lab.paper.section import Check, Section, Table, explained, panels
 from hapticbridge.theory.bounds import (
-    late_minimum_damping,
     maximum_stiffness,
     minimum_damping,
+    wall_damping,
+    worst_frequency,
 )
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand, stability_limit
 from hapticbridge.theory.spectrum import (
-    Transfer,
     damping_spectrum,
     damping_spectrum_of,
     needed_for_fixed_environment,
@@ -58,12 +66,6 @@ def spring_and_damper(z: _Complex) -> _Complex:
     return np.asarray(K + B / PERIOD * (1 - 1 / z))
 
 
-def one_tick_late(transfer: Transfer) -> _Real:
-    """Returns the damping at each frequency, if the device alone gets its force a tick late."""
-    in_time = np.asarray(damping_spectrum_of(transfer, PERIOD, THETA / PERIOD))
-    return np.asarray((1 - np.cos(2 * THETA)) / (1 - np.cos(THETA)) * in_time)
-
-
 def at_limit(quantity: str, expected: float, loop: SampledLoop, *, route: str = "") -> Check:
     """Compares a damping in N s/m with that at which a sampled loop is at its limit."""
     return Check(
@@ -98,7 +100,8 @@ def any_coupling() -> Section:
     figure, (axes,) = panels(1, height=4.2)
     for name, curve in curves.items():
         axes.plot(HERTZ, curve, label=name)
-    axes.plot(HERTZ, one_tick_late(spring_and_damper), label="(4), the device one tick late")
+    late = damping_spectrum_of(spring_and_damper, PERIOD, omega, delay=1)
+    axes.plot(HERTZ, late, label="(4), the device one tick late")
     axes.set(xlabel="frequency (Hz)", ylabel="device damping needed (N s/m)", ylim=(0, 8))
     axes.legend(fontsize="small", loc="upper left")
 
@@ -138,15 +141,21 @@ def any_coupling() -> Section:
                 quantity="spring, the device one tick late, b = 2KT for every environment",
                 route="frequency sweep",
                 expected=2 * K * PERIOD,
-                got=float(one_tick_late(lambda z: np.full_like(z, K)).max()),
+                got=float(
+                    np.max(
+                        damping_spectrum_of(lambda z: np.full_like(z, K), PERIOD, omega, delay=1)
+                    )
+                ),
                 unit="N s/m",
                 tolerance=1e-4,
             ),
             Check(
                 quantity="spring and damper, the device one tick late, for every environment",
-                route="frequency sweep",
-                expected=float(late_minimum_damping(K, B, PERIOD, delay=PERIOD)),
-                got=float(one_tick_late(spring_and_damper).max()),
+                route="frequency sweep, against T y³/(2 (y² − K²)), y = K + 2B/T",
+                expected=PERIOD
+                * (K + 2 * B / PERIOD) ** 3
+                / (2 * ((K + 2 * B / PERIOD) ** 2 - K**2)),
+                got=float(np.max(late)),
                 unit="N s/m",
                 tolerance=1e-4,
             ),
@@ -593,6 +602,42 @@ def _in_mujoco(share: float) -> NDArray[np.float64]:
     return hold(ImplicitMass(COUPLING, PERIOD, HEAVY).force, hand, TICKS)
 
 
+LATE = spring_with(0.5)
+"""Coupling of the device that is a tick late: a tool of 3 g is the worst behind it."""
+
+
+def worst_tool() -> tuple[float, float, complex]:
+    """Returns the mass in kg of the worst lossless tool a tick late, ω in rad/s, and H in N/m.
+
+    A closed loop swings for ever at equality of the condition if its tool adds the imaginary part
+    that u/C and the worst hand leave over: T²/(2m tan(θ/2)) = Im(u/C) − (T/2b) sin 2θ.
+    """
+    omega = float(worst_frequency(LATE, PERIOD, delay=1))
+    theta, late = omega * PERIOD, np.exp(-1j * omega * PERIOD)
+    c = complex(LATE.stiffness + LATE.damping / PERIOD * (1 - late))
+    b = minimum_damping(LATE, PERIOD, delay=1)
+    left = ((1 - late) / c).imag - PERIOD / (2 * b) * np.sin(2 * theta)
+    mass = float(PERIOD**2 / (2 * np.tan(theta / 2) * left))
+    tool = PERIOD**2 / (2 * mass) * (1 + late) / (1 - late) ** 2
+    return mass, omega, complex(late * c / (1 + c * tool))
+
+
+def behind_a_tick(mass: float) -> Callable[[float], float]:
+    """Returns the force on a device a tick late, over the handle's position, of a lossless tool."""
+    k, rate, give = LATE.stiffness, LATE.damping / PERIOD, PERIOD**2 / (2 * mass)
+    position = velocity = stretch = sent = 0.0
+
+    def respond(handle: float) -> float:
+        nonlocal position, velocity, stretch, sent
+        free = position + PERIOD * velocity
+        force = ((k + rate) * (handle - free) - rate * stretch) / (1 + (k + rate) * give)
+        position, velocity = free + give * force, velocity + PERIOD / mass * force
+        stretch, late, sent = handle - position, sent, force
+        return late
+
+    return respond
+
+
 def worst_hand_section() -> Section:
     """Shows that the bounds are reached.
 
@@ -601,8 +646,9 @@ def worst_hand_section() -> Section:
     until the loop is marginal. Its recursion under a held force is exact. With it a time-domain
     loop loses stability where the bound over frequency says.
 
-    With the delay of one sample the bound is that against a wall. At Nyquist Z_0 = 0 and the
-    device's damper alone is the worst hand.
+    At Nyquist Z_0 = 0 and the device's damper alone is the worst hand. With the delay of one sample
+    the bound of the picture is that against a wall. A tool that moves needs more: the bound for
+    every scene is reached by a hand and a lossless tool together.
     """
     figure, (delayed, simulated) = panels(1, height=4.0, columns=2)
     loop = SampledLoop(COUPLING, PERIOD, delay=1)
@@ -621,10 +667,24 @@ def worst_hand_section() -> Section:
     checks = []
     for period, delay, filter_time in product(PERIODS, DELAYS, FILTER_TIMES):
         case = SampledLoop(COUPLING, period, delay=delay, filter_time=filter_time)
-        expected = float(minimum_damping(COUPLING, period, delay=delay, filter_time=filter_time))
-        case_name = f"T = {1e3 * period:g} ms, delay {delay}, τ = {1e3 * filter_time:g} ms"
+        expected = float(wall_damping(COUPLING, period, delay=delay, filter_time=filter_time))
+        case_name = f"wall, T = {1e3 * period:g} ms, delay {delay}, τ = {1e3 * filter_time:g} ms"
         found = at_limit(f"{case_name}: b at the limit", expected, case)
         checks.append(replace(found, route=f"{found.route}, against the bound over frequency"))
+    mass, omega, response = worst_tool()
+    y = LATE.stiffness + 2 * LATE.damping / PERIOD
+    checks.append(
+        Check(
+            quantity=f"any scene, device one tick late, tool of {1e3 * mass:.1f} g: b at the limit",
+            route="time-domain loop, bisection, against T y³/(2 (y² − K²)), y = K + 2B/T",
+            expected=PERIOD * y**3 / (2 * (y**2 - K**2)),
+            got=limit_of(
+                lambda: behind_a_tick(mass), lambda b: WorstHand(b, omega, PERIOD, response)
+            ),
+            unit="N s/m",
+            tolerance=1e-3,
+        )
+    )
     checks.extend(
         Check(
             quantity=f"heavy tool, b = {share:g} of (6): 1 if the force decays",
