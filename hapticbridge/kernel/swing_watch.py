@@ -34,13 +34,13 @@ Findings, for translation and rotation each; E is 8 mJ at a limit of 10 N or 0.5
     ms without a stated delay, with E_s >= E for 40 ms; or c <= 0 and p < 0.6 with c_s >= 0.4 for 12
     ms. The greatest ratio r of the lever between device and handle is halved, hence the stiffness
     quartered; again for each E_s >= E.
-    slammed: with w and v of every tick above 25 Hz, sums over 0.3 s, and w_d the force of d earlier,
-    b Σ v² − Σ w·v is 6.4 mW or more on average over 0.3 s, at a limit of 10 N or 0.5 N m, and 90 %
-    of that average now, since a single blow is forgotten; and Σ w_d·v >= 1.1 b Σ v² for a d of 1 or
-    2 ms, each for 0.25 s. r is halved. No hand swings so fast, and a force that acts later explains
-    the motion, so it did. d begins at a stated delay, whose w_d also replaces w if it gives more
-    work. Blows on a stop of the device lack energy, too, but no force explains them. Of an unknown
-    damping b = 0 counts.
+    slammed: w and v are the ones of every tick above 25 Hz, sums are over 0.3 s, w_d is the force
+    of d earlier. b Σ v² − Σ w·v is 6.4 mW or more on average over 0.3 s, at a limit of 10 N or 0.5
+    N m, and 90 % of that average now, since a single blow is forgotten; and Σ w_d·v >= 1.1 b Σ v²
+    for a d of 1 or 2 ms, each for 0.25 s. r is halved. No hand swings so fast, and a force that
+    acts later explains the motion, so it did. d begins at a stated delay, whose w_d also replaces w
+    if it gives more work. Blows on a stop of the device lack energy, too, but no force explains
+    them. Of an unknown damping b = 0 counts.
     coarse: 3 steps within 0.3 s. r is halved. A step is a new sample that follows equal ones of 4
     ms and more, and over which the coupling pulls with half the limit, r K ‖δp‖ >= F/2.
 
@@ -76,7 +76,7 @@ swing has p = 0.9, c = −0.04, x > 0.6 and c_s = 0.76; faults have p < 0.6. The
 Steps of 4 mm swing between two samples 40 to 90 times a second and give at most 17 mJ. A device
 that starts from rest moves by 0.1 mm in a tick of 1 ms: 10 N on 0.05 kg.
 
-Limits of the method: a slam gives up to 2 J before it is found (4 kHz; 1.4 J at 1 kHz), and a
+Limits of the method: a slam gives up to 1.7 J before it is found (stiff hands, 1 kHz), and a
 smaller one some mW for as long as it lasts. A motor that holds for 60 ms gives two fingers up to
 0.4 J within one hold, before a lower force could reach it, and 0.8 J where two throws were needed.
 A torque 12 to 20 ms late gives two fingers up to 0.5 J within the throw in which it is found. A
