@@ -76,7 +76,7 @@ swing has p = 0.9, c = −0.04, x > 0.6 and c_s = 0.76; faults have p < 0.6. The
 Steps of 4 mm swing between two samples 40 to 90 times a second and give at most 17 mJ. A device
 that starts from rest moves by 0.1 mm in a tick of 1 ms: 10 N on 0.05 kg.
 
-Limits of the method: a slam gives up to 1.7 J before it is found (stiff hands, 1 kHz), and a
+Limits of the method: a slam of a stiff hand gives up to 3.5 J until it rests (1 kHz), and a
 smaller one some mW for as long as it lasts. A motor that holds for 60 ms gives two fingers up to
 0.4 J within one hold, before a lower force could reach it, and 0.8 J where two throws were needed.
 A torque 12 to 20 ms late gives two fingers up to 0.5 J within the throw in which it is found. A
