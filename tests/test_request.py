@@ -83,8 +83,9 @@ def one_hand(scene: str = "point_mass", **choices: Any) -> Callable[[Path], Brid
     """Returns a bridge of one hand; ``sheet`` are fields of its device's data sheet."""
 
     def bridge(path: Path) -> Bridge:
-        own: dict[str, Any] = {"clock": hb.SimulatedClock(), "sheet": {}, "coupling": None}
+        own: dict[str, Any] = {"clock": hb.SimulatedClock, "sheet": {}, "coupling": None}
         own |= choices
+        own["clock"] = own["clock"]()  # a new one for each run
         sheet, coupling = own.pop("sheet"), own.pop("coupling")
         moved = ScriptedDevice(drift, buttons=lambda tick: 2 + 4 * (tick % 20 > 10), **sheet)
         return Bridge(scene, moved, coupling, recording=path, **own)
@@ -133,7 +134,7 @@ RUNS: dict[str, Callable[[Path], Bridge]] = {
     "a slower scene": one_hand(scene_rate=250.0),
     "absolute poses": one_hand(workspace=Workspace(absolute=True)),
     "a massless tool": one_hand(method="direct", contact_stiffness=300.0),
-    "a real device": one_hand(clock=RealTime(), sheet=REAL, live=True, realtime=True),
+    "a real device": one_hand(clock=RealTime, sheet=REAL, live=True, realtime=True),
     "a grip axis": two_hands,
 }
 
