@@ -34,11 +34,13 @@ Findings, for translation and rotation each; E is 8 mJ at a limit of 10 N or 0.5
     ms without a stated delay, with E_s >= E for 40 ms; or c <= 0 and p < 0.6 with c_s >= 0.4 for 12
     ms. The greatest ratio r of the lever between device and handle is halved, hence the stiffness
     quartered; again for each E_s >= E.
-    slammed: b Σ V² − Σ W·V is 3 mW or more on average over 0.3 s, at a limit of 10 N or 0.5 N m,
-    and half of that average now, since a single blow is forgotten; and Σ W·V + 2 ms Σ W·A >= b Σ
-    V²/2, each for 0.3 s. r is halved. No hand swings so fast, and a force that acts later explains
-    the motion, so it did. Blows on a stop of the device lack energy, too, but come without a force:
-    Σ W·V < 0, Σ W·A is small. Of an unknown damping b = 0 counts.
+    slammed: w and v are the ones of every tick above 25 Hz, sums are over 0.3 s, w_d is the force
+    of d earlier. b Σ v² − Σ w·v is 6.4 mW or more on average over 0.3 s, at a limit of 10 N or 0.5
+    N m, and 90 % of that average now, since a single blow is forgotten; and Σ w_d·v >= 1.1 b Σ v²
+    for a d of 1 or 2 ms, each for 0.25 s. r is halved. No hand swings so fast, and a force that
+    acts later explains the motion, so it did. d begins at a stated delay, whose w_d also replaces w
+    if it gives more work. Blows on a stop of the device lack energy, too, but no force explains
+    them. Of an unknown damping b = 0 counts.
     coarse: 3 steps within 0.3 s. r is halved. A step is a new sample that follows equal ones of 4
     ms and more, and over which the coupling pulls with half the limit, r K ‖δp‖ >= F/2.
 
@@ -74,7 +76,7 @@ swing has p = 0.9, c = −0.04, x > 0.6 and c_s = 0.76; faults have p < 0.6. The
 Steps of 4 mm swing between two samples 40 to 90 times a second and give at most 17 mJ. A device
 that starts from rest moves by 0.1 mm in a tick of 1 ms: 10 N on 0.05 kg.
 
-Limits of the method: a slam gives up to 2 J before it is found (4 kHz; 1.4 J at 1 kHz), and a
+Limits of the method: a slam of a stiff hand gives up to 3.5 J until it rests (1 kHz), and a
 smaller one some mW for as long as it lasts. A motor that holds for 60 ms gives two fingers up to
 0.4 J within one hold, before a lower force could reach it, and 0.8 J where two throws were needed.
 A torque 12 to 20 ms late gives two fingers up to 0.5 J within the throw in which it is found. A
@@ -91,6 +93,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.kernel.codes import (
     PROBED,
@@ -102,7 +105,7 @@ from hapticbridge.kernel.codes import (
     State,
 )
 from hapticbridge.kernel.jit import compiled
-from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.parameters import RunParameters, whole_ticks
 from hapticbridge.kernel.pose import Vector, norm
 
 BLOCK = 0.004
@@ -150,10 +153,16 @@ STEPS, STEP = 3.0, 0.5
 """Number of steps for a finding, and the least share of the limit that a step is worth; no unit. A
 lower share takes steps of 0.2 mm at 2400 N/m and a limit of 2 N, which can be felt, for a fault."""
 
-SLAM, LATER = 0.4, 0.002
-"""Least missing power of a slam in E per s, and the delay in s of the force that explains it. A
-lower ``SLAM`` finds smaller swings; steps of an encoder of 0.2 mm seem to burn 0.1 E per s. With 3
-ms, blows on a stop of the device are taken for slams; with 1 ms, one swing in ten is not found."""
+SLAM, GOES_ON, EXPLAINED, LASTS = 0.8, 0.9, 1.1, 0.25
+"""Least missing power of a slam in E per s, least share of its average that is missing now, least
+ratio of a later force's work to b Σ v², and time in s for which all hold. A lower ``SLAM`` takes
+swings of an encoder with steps of 0.2 mm for slams; lower shares and times take the ringing of
+stiff hands, or blows on a stop. All of these last for up to 0.19 s, and true swings go on."""
+
+SENT_LAGS, SWUNG = (0.0, 0.0, 0.001, 0.002), 25.0
+"""Ages of forces in s, all but the first beyond a stated delay, and corner in Hz of their filter. A
+block hides swings of 100 to 170 Hz. A lower corner leaves more of a hand's blows; with 3 ms, blows
+on a stop of the device are taken for slams."""
 
 ANSWERS, STRIDE = 6, 2
 """Number of lags of c_s, and blocks from one to the next: 8, 16 to 48 ms. A motor that holds for 60
@@ -188,8 +197,9 @@ PUSH, PUSH_SHARE = (1.5, 0.075), 0.15
 share of the limit. A probe takes three quarters of it away, more than twice the friction of a
 desktop device. A strong device, as a wheel of 2 N m, has more friction."""
 
-RING = 16
-"""Blocks that are kept for late work."""
+RING, SENT, SPREAD = 16, 64, 16
+"""Blocks that are kept for late work, ticks of the force that are kept, and most ticks over which
+the motion of a sample is spread."""
 
 WATCH_DTYPE = np.dtype(
     [
@@ -230,6 +240,15 @@ WATCH_DTYPE = np.dtype(
         ("change", "<f8", 3),
         ("known_damping", "<f8", 2),
         ("missing_power", "<f8", 2),
+        ("sent_lags", "<i8", len(SENT_LAGS)),
+        ("slam_blocks", "<i8"),
+        ("swung_corner", "<f8"),
+        ("swung_kept", "<f8"),
+        ("swung_slow", "<f8", 24),
+        ("sent", "<f8", 6 * SENT),
+        ("sent_ticks", "<i8"),
+        ("swung_square", "<f8", 2),
+        ("sent_power", "<f8", 2 * len(SENT_LAGS)),
         ("wrench_square", "<f8", 2),
         ("speed_square", "<f8", 2),
         ("change_square", "<f8", 2),
@@ -263,7 +282,8 @@ N m, ``late_energy`` E in J. ``cap`` is the greatest ratio after all findings, `
 allowed now, ``returns_to`` the ratio before a probe; ``probe_end`` and ``rest_end`` in blocks.
 ``wrench`` and ``motion`` are sums over the block. ``wrench_square`` to ``across`` are the sums over
 W and A, ``whole_square`` that of all acceleration; ``believed`` and ``delayed`` are E_0 and E_s;
-``known_damping`` is b or 0, and ``missing_power`` the average of what a slam lacks in W;
+``known_damping`` is b or 0, and ``missing_power`` the average of what a slam lacks;
+``sent`` is a ring of w by tick, ``swung_square`` Σ v² and ``sent_power`` the sums Σ w_d·v;
 ``late_along`` are the sums over W_{k−s}·A, and ``past_means`` and ``past_squares`` rings of W and
 Σ W². ``still`` counts the equal samples before this one, and
 ``steps`` the coarse steps of late; ``counts`` are blocks in a row of late, reversed, exchanged,
@@ -287,6 +307,12 @@ def bind_watch(watch: Part, parameters: RunParameters) -> None:
     watch["corner"] = 1.0 - math.exp(-2.0 * math.pi * SLOWEST * block)
     memories = FAST_MEMORY, WORK_MEMORY, GAIN_MEMORY
     watch["kept"] = [math.exp(-block / memory) for memory in memories]
+    stated = whole_ticks(limits.stated_delay, period)
+    lags = [max(round(lag / period), lag > 0.0) + stated for lag in SENT_LAGS]
+    watch["sent_lags"] = [0] + [min(lag, SENT - SPREAD) for lag in lags[1:]]
+    watch["slam_blocks"] = max(round(LASTS / block), 1)
+    watch["swung_corner"] = 1.0 - math.exp(-2.0 * math.pi * SWUNG * period)
+    watch["swung_kept"] = math.exp(-period / WORK_MEMORY)
     watch["limits"] = parameters.force_limit, parameters.torque_limit
     level = parameters.force_limit / USUAL_FORCE, parameters.torque_limit / USUAL_TORQUE
     watch["late_energy"] = [limits.swing_energy * part for part in level]
@@ -339,6 +365,7 @@ def watch_device(s: State, moved: Vector, turned: Vector, interval: float) -> No
             wrench[3 + i] += w[3 + i]
             motion[i] += part * moved[i]
             motion[3 + i] += part * turned[i]
+        _add_tick(s, moved, turned, interval)
     scale, force_scale = s.run.scale, s.run.force_scale
     _count_step(s, 0, moved, interval, force_scale * scale * s.coupling.stiffness)
     _count_step(s, 1, turned, interval, force_scale / scale * s.coupling.rotational_stiffness)
@@ -347,6 +374,34 @@ def watch_device(s: State, moved: Vector, turned: Vector, interval: float) -> No
     if watch.ticks >= watch.block_ticks * (LONGEST_BLOCK if is_stale else 1):
         _close_block(s)
         watch.ticks = 0
+
+
+@compiled
+def _add_tick(s: State, moved: Vector, turned: Vector, interval: float) -> None:
+    """Adds the work of sent forces; the motion of a new sample is even since the last one."""
+    watch, sent, corner = s.watch, s.watch.sent, s.watch.swung_corner
+    at = watch.sent_ticks % SENT
+    watch.sent_ticks += 1
+    for i in range(6):
+        force = s.loop.wrench_on_device[i]
+        sent[6 * at + i] = _without_slow(watch.swung_slow, corner, i, force)
+    if s.loop.external_flags & STALE_SAMPLE:
+        return
+    period, count = s.run.period, len(SENT_LAGS)
+    ticks = min(max(round(interval / period), 1), SPREAD)
+    for tick in range(at - ticks + 1, at + 1):
+        for kind in range(2):
+            motion = turned if kind else moved
+            watch.swung_square[kind] *= watch.swung_kept
+            for d in range(count):
+                watch.sent_power[count * kind + d] *= watch.swung_kept
+            for i in range(3):
+                axis = 3 * kind + i
+                speed = _without_slow(watch.swung_slow, corner, 6 + axis, motion[i] / interval)
+                watch.swung_square[kind] += period * speed * speed
+                for d in range(count):
+                    force = sent[6 * ((tick - watch.sent_lags[d]) % SENT) + axis]
+                    watch.sent_power[count * kind + d] += period * force * speed
 
 
 @compiled
@@ -466,9 +521,8 @@ def _has_left(watch: Part, kind: int, axis: int, is_judged: bool) -> bool:
 
 
 @compiled
-def _without_slow(watch: Part, at: int, value: float) -> float:
+def _without_slow(slow: NDArray[np.float64], corner: float, at: int, value: float) -> float:
     """Returns a value less what swings slowly: two filters of first order in a row."""
-    slow, corner = watch.slow, watch.corner
     slow[at] += corner * (value - slow[at])
     value -= slow[at]
     slow[at + 12] += corner * (value - slow[at + 12])
@@ -520,8 +574,8 @@ def _add_block(s: State, kind: int) -> None:
         change -= wrench * faster
         whole_square += faster * faster
         # the work of a late wrench
-        slow_wrench = _without_slow(watch, at, wrench)
-        motion = _without_slow(watch, 6 + at, moved)
+        slow_wrench = _without_slow(watch.slow, watch.corner, at, wrench)
+        motion = _without_slow(watch.slow, watch.corner, 6 + at, moved)
         ring[6 * (watch.blocks % RING) + at] = slow_wrench
         burnt += b * motion * motion / block
         watch.believed[kind] += slow_wrench * motion
@@ -587,19 +641,20 @@ def _late_answer(watch: Part, kind: int, least: float) -> float:
 
 
 @compiled
-def _is_slammed(watch: Part, kind: int, taken: float) -> bool:
+def _is_slammed(watch: Part, kind: int) -> bool:
     """Adds a block to the missing power; returns True if a late force has long explained it."""
-    burnt = watch.known_damping[kind] * watch.speed_square[kind]
-    power = (burnt - taken) / FAST_MEMORY
+    work, at = watch.sent_power, len(SENT_LAGS) * kind
+    burnt = watch.known_damping[kind] * watch.swung_square[kind]
+    power = (burnt - max(work[at], work[at + 1])) / WORK_MEMORY
     mean = watch.kept[1] * (watch.missing_power[kind] - power) + power
     watch.missing_power[kind] = mean
-    is_explained = taken + LATER * watch.along[kind] >= 0.5 * burnt
-    goes_on = 2.0 * power >= mean  # not one blow that is being forgotten
+    is_explained = max(work[at + 2], work[at + 3]) >= EXPLAINED * burnt
+    goes_on = power >= GOES_ON * mean  # not one blow that is being forgotten
     if mean >= SLAM * watch.late_energy[kind] * watch.cap and is_explained and goes_on:
         watch.counts[6 * kind + 5] += 1
     else:
         watch.counts[6 * kind + 5] = 0
-    return bool(watch.counts[6 * kind + 5] >= watch.ring_blocks and watch.cap > 0.0)
+    return bool(watch.counts[6 * kind + 5] >= watch.slam_blocks and watch.cap > 0.0)
 
 
 @compiled
@@ -641,7 +696,7 @@ def _verdict(s: State, kind: int) -> int:
     is_answered = is_answered and _late_answer(watch, kind, least) >= ANSWERED
     is_answered = is_answered and watch.blocks >= watch.rings_end[kind]
     counts[at + 3] = counts[at + 3] + 1 if is_answered else 0
-    is_slammed = _is_slammed(watch, kind, taken)
+    is_slammed = _is_slammed(watch, kind)
     if counts[at + 1] >= BLOCKS or counts[at + 2] >= BLOCKS:
         return RUNS_AWAY
     has_swung = watch.flags & SWINGING != 0
