@@ -319,7 +319,6 @@ def hidden(run: Callable[[Path], Path], change: Change, why: str) -> Forgery:
     return Forgery(run, change, "passive", "unverified", why)
 
 
-EARLY = "an honest recorder may find the disk full before it writes the start"
 UNREACHED = "a limit that the run never reached: an honest run with it has the same records"
 OWN_WORD = "a statement of the user or the machine, that nothing else in the file depends on"
 LESS = "it claims less: an uncertified device, or a run without a guard"
@@ -448,7 +447,6 @@ FORGERIES: dict[str, Forgery] = {
     "reason of the stop": hidden(hand, event("stop", reason="caller"), OWN_WORD),
     "two stops": seen(hand, lambda r: {"events": [*r.events, r.events[-1]]}),
     "event before the start": seen(hand, added(0, {"event": "mark", "tick": 0})),
-    "disk full before the start": hidden(hand, added(0, {"event": "disk_full", "tick": 0}), EARLY),
     "event after the stop": seen(hand, added(2, {"event": "mark", "tick": 200})),
     "event after the end": seen(busy, event("input", tick=100_000)),
     "event without a tick": seen(busy, event("input", tick=None)),

@@ -132,18 +132,12 @@ _KINDS = {"guard": "guard parameter", "device": "data of the device:"}
 # Events against records
 
 
-def _name_of(event: Mapping[str, Any]) -> Any:
-    return event.get("event")
-
-
 def event_statements(recording: RecordingFile, timing: TimingTally) -> Iterator[Statement]:
     """Yields what the records determine of the events."""
     events, count = recording.events, recording.count
     names = Counter(str(event.get("event")) for event in events)
     yield Statement("number of events 'start'", names["start"], 1, "one run")
-    # the recorder may find the disk full before it writes the start
-    first = next((name for name in map(_name_of, events) if name != "disk_full"), None)
-    yield Statement("first event", first, "start", "one run")
+    yield Statement("first event", events[0].get("event"), "start", "one run")
     if recording.cut_sentence:  # records may be missing
         return
     yield Statement("number of events 'stop'", names["stop"], 1, "one run")

@@ -407,7 +407,7 @@ class Run:
         if self.options.rate is None and options.loop_rate < USUAL_RATE:
             notify(
                 f"the loop runs at {options.loop_rate:.4g} Hz, as often as the device has a new "
-                f"sample; walls are harder so than at {USUAL_RATE:g} Hz (--rate sets another)"
+                f"sample: it bears stiffer walls so than at {USUAL_RATE:g} Hz (--rate sets another)"
             )
         return replace(self, options=options)
 

@@ -13,8 +13,8 @@ from hapticbridge.demand.loop_setting import (
     IN_TIME,
     Axis,
     LoopSetting,
+    assumed_lag,
     device_period,
-    guarded_lag,
     required_damping,
 )
 from hapticbridge.demand.methods import Method, default_method
@@ -68,11 +68,10 @@ def default_coupling(
 
     The result is the requested coupling: K and B = B' + the method's own damping, so that the law
     uses B' without clipping. It needs 85 % of b. Behind a device that is late the ratio B'/K is the
-    one with the largest K (``theory.bounds.stiffest_late_coupling``); a delay that is stated and
-    not measured counts as one tick more. If several evaluations per
-    tick need more, or friction does not hold the encoder's steps, K and B' are lowered together;
-    both conditions are linear in both. Without any friction no coupling is free of swings by steps,
-    so damping alone decides, and the condition says so.
+    one with the largest K (``theory.bounds.stiffest_late_coupling``), for the ``assumed_lag``. If
+    several evaluations per tick need more, or friction does not hold the encoder's steps, K and B'
+    are lowered together; both conditions are linear in both. Without any friction no coupling is
+    free of swings by steps, so damping alone decides, and the condition says so.
 
     Args:
         info: The device; unknown damping is replaced as in ``assumed_damping``.
@@ -94,7 +93,7 @@ def default_coupling(
     coupling = stiffest_coupling(damping, rotational, period)
     checked_substeps(law_evaluations, CouplingError)
     method = default_method(law_evaluations) if method is None else method
-    lag = guarded_lag(info, period)
+    lag = assumed_lag(info, period)
     if lag != IN_TIME:
         linear = stiffest_late_coupling(damping, period, lag.delay, lag.ticks_per_sample)
         coupling = replace(coupling, stiffness=linear[0], damping=linear[1])
@@ -324,7 +323,7 @@ def _condition(loop: LoopSetting, axis: Axis, available: float | None) -> Dampin
     needed, remedy = loop.needed(axis), ""
     if available is not None and available < needed:
         remedy = _remedy(loop, axis, available)
-    unconfirmed, lag = None, guarded_lag(loop.info, loop.period)
+    unconfirmed, lag = None, assumed_lag(loop.info, loop.period)
     if lag != loop.lag:
         bears = available is not None and available >= loop.needed(axis, lag)
         unconfirmed = lag.delay if bears else loop.lag.delay

@@ -82,7 +82,7 @@ UNCONFIRMED = 1e-3
 usual rate. A larger value makes the couplings of unmeasured devices softer."""
 
 
-def guarded_lag(info: DeviceInfo, period: float) -> Lag:
+def assumed_lag(info: DeviceInfo, period: float) -> Lag:
     """Returns the lag for which a coupling is chosen, with T in s.
 
     A delay that the device states and no measurement confirms counts as one tick more, at most

@@ -108,7 +108,9 @@ class HandEnergy:
     @property
     def blur(self) -> str:
         """Energy that no meter of stepped positions sees, as a clause; empty without steps."""
-        return f"may hide {format_energy(2.0 * self.hidden)} to the hand" if self.hidden else ""
+        return (
+            f"may hide {format_energy(2.0 * self.hidden)} that the hand got" if self.hidden else ""
+        )
 
     @property
     def sentence(self) -> str:

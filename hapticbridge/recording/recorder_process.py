@@ -233,7 +233,7 @@ class _Session:
         self._batch = BATCH // self._hands * self._hands
         self._last_time = 0
         self._last_tick = -1
-        self._has_reported_full = False
+        self._has_begun = self._has_reported_full = False
 
     def run(self, inbox: SimpleQueue[dict[str, Any] | None]) -> None:
         """Records until the bridge closes or dies."""
@@ -273,8 +273,13 @@ class _Session:
         return int(rows.size)
 
     def _report_if_full(self) -> None:
-        """Reports a full disk once; the reserve holds the data until the bridge ends."""
-        if self._writer is not None and self._writer.is_full and not self._has_reported_full:
+        """Reports a full disk once; the reserve holds the data until the bridge ends.
+
+        Records may arrive before the event of the start, which is the first one of a recording.
+        """
+        if self._writer is None or not self._has_begun:
+            return
+        if self._writer.is_full and not self._has_reported_full:
             self._has_reported_full = True
             self._write_event({"event": "disk_full", "tick": self._last_tick}, self._last_time)
             _answer(full=True)
@@ -295,6 +300,7 @@ class _Session:
     def _write_event(self, event: dict[str, Any], time_ns: int) -> None:
         if self._writer is not None:
             self._writer.write_event(event, time_ns)
+            self._has_begun = True
 
 
 def listen(stream: IO[bytes], inbox: SimpleQueue[dict[str, Any] | None]) -> None:
