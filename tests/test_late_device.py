@@ -653,6 +653,14 @@ def test_the_energy_to_a_hand_is_known_up_to_what_steps_hide() -> None:
     assert any(is_exceeded)  # by the positions as they were read
 
 
+@pytest.mark.parametrize("stiffness", [10.0, 300.0])
+def test_a_step_in_one_tick_is_no_fast_motion(stiffness: float) -> None:
+    # let go away from rest: a slow hand burns far less than b Δ²/T a step
+    device = OwnDevice((stiffness, 0.1), step=2e-4, start=(-0.02, 0.0), resolution=2e-4)
+    found = metered(device, 100.0, controller="off", limits=Limits(energy=math.inf))
+    assert device.got <= found["net_device_energy"] + found["hidden_energy"]
+
+
 def test_steps_that_are_stated_are_not_taken_for_energy() -> None:
     for stated in (2e-4, None):
         device = OwnDevice((2.0, 0.1), step=2e-4, start=(0.03, 1.0), resolution=stated)
