@@ -14,6 +14,7 @@ import sys
 import tempfile
 import tracemalloc
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,7 +29,15 @@ from recording_cases import EPOCH, FILES, META, chunks, random_rows, same, write
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.kernel.record import FORMAT, TICK_DTYPE
-from hapticbridge.recording import Attachment, Recording, RecordingWriter, read_recording, repair
+from hapticbridge.recording import (
+    Attachment,
+    Recorder,
+    Recording,
+    RecordingWriter,
+    Ring,
+    read_recording,
+    repair,
+)
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.container import DamageError, Fields
 from hapticbridge.recording.writer import RESERVE, ChunkIndexFile
@@ -338,6 +347,25 @@ def test_room_for_the_end_is_claimed(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert path.stat().st_blocks * 512 < path.stat().st_size + 2**16
     recording = read_recording(path)
     assert (len(recording.ticks), recording.is_cut) == (3000, False)
+
+
+def test_a_disk_found_full_before_the_start_is_reported_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(RecordingWriter, "is_full", True)
+    with closing(Ring.shared(64)) as ring:
+        recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
+        recorder.start()
+        recorder.wait_until_ready()
+        ring.append(random_rows(8))
+        while ring.pending():  # then it has looked at the disk, or is about to
+            assert recorder.is_alive()
+        recorder.event({"event": "start"}, 0)
+        while not recorder.is_disk_full:
+            assert recorder.is_alive()
+        recorder.close()
+    names = [event["event"] for event in read_recording(tmp_path / "run.mcap").events]
+    assert names == ["start", "disk_full"]
 
 
 def test_a_file_that_is_being_recorded_to_is_not_taken_over(tmp_path: Path) -> None:

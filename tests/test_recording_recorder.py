@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from queue import SimpleQueue
 from types import SimpleNamespace
 from typing import Any
 
@@ -28,7 +27,6 @@ from hapticbridge.recording import (
     Recorder,
     Ring,
     read_recording,
-    recorder_process,
 )
 from hapticbridge.recording import recorder as recorder_module
 from hapticbridge.recording.recorder import RecordOutput, RecordStream
@@ -419,36 +417,3 @@ def test_a_stop_while_the_process_starts_leaves_neither_process_nor_file(
     stream.close(is_discarded=True)
     assert started[0].poll() is not None
     assert not path.exists()
-
-
-class FullDisk:
-    """A writer on a full disk; keeps the names of the events."""
-
-    is_full = True
-
-    def __init__(self) -> None:
-        self.events: list[str] = []
-
-    def write_event(self, event: dict[str, Any], _: int) -> None:
-        self.events.append(event["event"])
-
-    def close(self) -> None:
-        pass
-
-
-def test_a_full_disk_is_reported_after_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    session, inbox = object.__new__(recorder_process._Session), SimpleQueue[Any]()
-    writer, late = FullDisk(), [None, {"event": "start", "time_ns": 0}, {"close": True}]
-
-    def drain() -> int:  # the start arrives after the disk was found full
-        if late and (event := late.pop(0)) is not None:
-            inbox.put(event)
-        return 0
-
-    own: dict[str, Any] = {"_writer": writer, "_live": None, "_parent": os.getppid(), "_batch": 1}
-    own |= {"_last_tick": -1, "_last_time": 0, "_drain_once": drain, "_path": Path()}
-    for name, value in (own | {"_has_begun": False, "_has_reported_full": False}).items():
-        setattr(session, name, value)
-    monkeypatch.setattr(recorder_process, "_answer", lambda **_: None)
-    session.run(inbox)
-    assert writer.events == ["start", "disk_full"]
