@@ -217,8 +217,33 @@ def _positive(unit: str) -> dict[str, Rule]:
     return rule(unit=unit, least=0.0, is_open=True)
 
 
+class StepTimes:
+    """Times of a scene that is stepped behind a loop, for a class with these three fields.
+
+    Attributes:
+        period: T in s.
+        substeps: MuJoCo steps per tick, or between two results of a slower scene.
+        scene_ticks: Ticks between two results of a slower scene; 0 if it steps in every tick.
+    """
+
+    __slots__ = ()
+    period: float
+    substeps: int
+    scene_ticks: int
+
+    @property
+    def scene_period(self) -> float:
+        """Time in s between two results of the scene."""
+        return max(self.scene_ticks, 1) * self.period
+
+    @property
+    def timestep(self) -> float:
+        """MuJoCo's h in s."""
+        return self.scene_period / self.substeps
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RunParameters:
+class RunParameters(StepTimes):
     """All numbers besides scene and device motion that the results of a run depend on.
 
     Attributes:
@@ -367,16 +392,6 @@ class RunParameters:
     def law_evaluations(self) -> int:
         """Evaluations of the tool's wrench per tick."""
         return 1 if self.scene_ticks else self.properties.law_evaluations(self.substeps)
-
-    @property
-    def scene_period(self) -> float:
-        """Time in s between two results of the scene."""
-        return max(self.scene_ticks, 1) * self.period
-
-    @property
-    def timestep(self) -> float:
-        """MuJoCo's h in s."""
-        return self.scene_period / self.substeps
 
     @property
     def has_law(self) -> bool:

@@ -56,6 +56,7 @@ from hapticbridge.kernel.parameters import (
     UNGUARDED,
     GuardParameters,
     RunParameters,
+    StepTimes,
     refuse_substeps,
     rotation_numbers,
 )
@@ -397,7 +398,7 @@ def _refuse_buttons(options: BridgeOptions, info: DeviceInfo, *, is_recorded: bo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RunSetup:
+class RunSetup(StepTimes):
     """Scene, device, coupling, method and guard of a run, checked against each other.
 
     Attributes:
@@ -507,16 +508,6 @@ class RunSetup:
             dead_man=button_mask(options.dead_man),
         )
         return replace(setup, guard=guard)
-
-    @property
-    def scene_period(self) -> float:
-        """Time in s between two results of the scene."""
-        return max(self.scene_ticks, 1) * self.period
-
-    @property
-    def timestep(self) -> float:
-        """MuJoCo's h in s."""
-        return self.scene_period / self.substeps
 
     @property
     def law(self) -> Coupling:

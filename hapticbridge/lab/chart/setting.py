@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.demand.methods import Method, method_named
 from hapticbridge.errors import StudyError
+from hapticbridge.kernel.parameters import StepTimes
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import Scene
 
@@ -45,7 +46,7 @@ SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class Setting(StepTimes):
     """All choices at a point.
 
     Attributes:
@@ -66,16 +67,6 @@ class Setting:
     iterations: int | None = None
     engine: str = OWN
     scene_ticks: int = 0
-
-    @property
-    def scene_period(self) -> float:
-        """Time between two results of the scene in s."""
-        return max(self.scene_ticks, 1) * self.period
-
-    @property
-    def timestep(self) -> float:
-        """MuJoCo's time step h in s."""
-        return self.scene_period / self.substeps
 
     @property
     def contact_name(self) -> str:
