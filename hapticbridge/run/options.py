@@ -149,12 +149,9 @@ class BridgeOptions:
             its own, and the tool is shown between its results, passively; its period is then the
             nearest one of whole ticks. 'auto' steps it in every tick if it can keep the rate on a
             real clock, measured at its start, else as often as it can.
-        method: Rendering method. 'lossless', the default: half of the coupling inside MuJoCo's
-            step, half carried over; second order away from contact. 'implicit', the default with
-            substeps: all of the coupling inside the step, which adds K T to the damping.
-            'compensated': 'implicit' with the added K T subtracted from the coupling's damping. Or
-            a method that exists to be compared, such as 'explicit', 'weld' or 'direct' (a tool
-            without mass); an unknown name lists them.
+        method: Rendering method: 'lossless', the default; 'implicit', the default with substeps;
+            'compensated'; or one that exists to be compared, such as 'explicit', 'weld' or
+            'direct' (a tool without mass). The run says what it does; an unknown name lists all.
         contact: Contacts. 'rigid', the default: strictly passive, sharp, with Coulomb friction in
             an elliptic cone. 'scene': MuJoCo's contacts with the settings of the MJCF, as methods
             for comparison have them.
