@@ -383,6 +383,7 @@ def test_a_run_that_is_not_recorded_cannot_be_marked(tmp_path: Path) -> None:
         bridge.command(Switch(force=False))
         assert bridge.run(0.05).ticks == 50
 
+
 def random_commands(rng: random.Random) -> dict[int, Command]:
     """Returns commands at random ticks of a run of 0.9 s."""
     kinds: tuple[Callable[[], Command], ...] = (
@@ -401,7 +402,10 @@ def test_commands_at_random_are_repeated_bit_for_bit(run: Callable[..., Any], se
     # hand at rest the handle jumped back once the force had risen
     rng = random.Random(seed)
     rests_from = rng.choice([0, 100, 300, 900])
-    options = {"method": rng.choice(["lossless", "implicit", "compensated"]), "pipelined": rng.random() < 0.3}
+    options = {
+        "method": rng.choice(["lossless", "implicit", "compensated"]),
+        "pipelined": rng.random() < 0.3,
+    }
     if rng.random() < 0.3:
         options["scene_rate"] = 250.0
     script = Script(random_commands(rng), is_refused=True)
