@@ -150,7 +150,7 @@ def test_the_loop_takes_the_rate_of_a_slower_device_which_is_stiffer(
 ) -> None:
     info, own_options = replace(REAL, **sheet), BridgeOptions(**chosen)
     assert own_options.for_devices([info]).loop_rate == rate
-    if rate < 1000.0:
+    if 1.0 < rate < 1000.0:
         usual, own = (default_coupling(info, 1.0 / each).stiffness for each in (1000.0, rate))
         assert own > 1.1 * usual
         fast = replace(info, rate=2000.0)  # it holds one force for half a tick
