@@ -32,7 +32,7 @@ from hapticbridge.scene import load_scene
 from hapticbridge.theory.bounds import minimum_damping
 
 DURATION = 1.5
-"""Of a run, in s."""
+"""Length of a run in s."""
 
 PINNED = """
 <mujoco>

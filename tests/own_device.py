@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drive:
-    """Where the hand wants the device to be, and how it turns it.
+    """Place and orientation that the hand wants, and its grip in rotation.
 
     Attributes:
         end: Time in s at which the hand is back, so that nothing stays stored.
