@@ -22,6 +22,7 @@ from two_hands import two_handed
 
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import conditions_of
 from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.methods import Method, method_named
 from hapticbridge.errors import SafetyTrip
@@ -124,9 +125,9 @@ def on_time(s: Draws) -> Case:
 def late(s: Draws) -> Case:
     """Forces 0.25 to 8 ms late; a default coupling bears a tick more than an unmeasured delay."""
     case, most, is_measured = Case.drawn(s), s.log(2.5e-4, 8e-3), s.pick(True, False)
-    most *= case.rate
-    true = most * s.pick(1.0, s.even(0.0, 1.0))
-    if s.pick(True, False):
+    most = s.pick(most * case.rate, math.ceil(most * case.rate))
+    true = most * s.pick(1.0, 1.0, s.even(0.0, 1.0))
+    if s.pick(True, True, False):
         case.at_bound(s.pick(0.0, s.log(0.1, 10.0)), most)
     elif not is_measured:
         true = most + s.pick(0.0, 0.5, 1.0) * min(1.0, 1e-3 * case.rate)
@@ -224,8 +225,8 @@ def held(case: Case, h: Draws) -> OwnDevice:
     stiffness, damping = mass * (h.log(3e-3, 3.0) * case.rate) ** 2, h.log(0.01, 3.0)
     start = h.log(1e-6, 5e-3), h.log(1e-4, 0.5)
     k_r = 1.0 if case.law is None else case.law.rotational_stiffness
-    spring, twist, wobble = k_r * h.log(0.3, 30.0), h.even(0.1, 2.8), h.log(1e-4, 1e-1)
-    inertia = float(np.clip((k_r + spring) / (h.log(3e-2, 3.0) * case.rate) ** 2, 1e-8, 1e-3))
+    spring, twist, wobble = k_r * h.log(0.5, 10.0), h.even(0.1, 2.8), h.log(1e-4, 1e-1)
+    inertia = float(np.clip((k_r + spring) / (h.log(0.1, 3.0) * case.rate) ** 2, 1e-8, 1e-3))
     if "torque_limit" not in case.sheet:
         twist, wobble = 0.0, 0.1 * wobble
     place, swing = h.pick(0.0, h.even(-2.0, 2.0) / stiffness), h.pick(0.0, h.log(1e-6, 1e-2))
@@ -260,7 +261,7 @@ class Outcome:
             the scene gave up of its storage.
         back: What the hands got over what went to and fro, at the end.
         blur: The most in J that steps may have added, as the summary prints it.
-        is_certified: As the summary says.
+        is_certified: True if the device conditions hold, whatever the run's own meters found.
     """
 
     energy: float
@@ -301,7 +302,8 @@ def outcome(case: Case, hands: Shares) -> Outcome:
             energy -= force_scale / scale * float(stored[0] - stored.min())
     through = max(sum(each.through for each in devices), 1e-12)
     back, blur = sum(each.got for each in devices) / through, 2.0 * summary.hand_energy.hidden
-    return Outcome(energy, back, blur, summary.is_certified is True)
+    conditions = conditions_of(bridge.setup.loop)
+    return Outcome(energy, back, blur, all(each.holds is not False for each in conditions))
 
 
 def attacked_on_device(kind: str, seed: int, steps: int = 0) -> Outcome:
