@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -44,15 +46,16 @@ def swaying(tick: int) -> tuple[float, ...]:
 class Script:
     """Gives commands at ticks of the run."""
 
-    def __init__(self, commands: Mapping[int, Command]) -> None:
-        self.commands, self.done = commands, 0
+    def __init__(self, commands: Mapping[int, Command], is_refused: bool = False) -> None:
+        self.commands, self.done, self.is_refused = commands, 0, is_refused
         self.stiffness: list[float] = []
         self.bound: list[float] = []
 
     def __call__(self, bridge: Bridge, _: int) -> None:
         bridge.session.commands.now = lambda: self.done * T
         if self.done in self.commands:
-            bridge.command(self.commands[self.done], by="test")
+            with suppress(*[CommandError] * self.is_refused):
+                bridge.command(self.commands[self.done], by="test")
         coupling = bridge.session.kernel.bound.state["coupling"][0]
         self.stiffness.append(float(coupling["stiffness"]))
         self.bound.append(float(coupling["stiffness"] * T / 2 + coupling["damping"]))
@@ -379,3 +382,41 @@ def test_a_run_that_is_not_recorded_cannot_be_marked(tmp_path: Path) -> None:
             bridge.command(Mark())
         bridge.command(Switch(force=False))
         assert bridge.run(0.05).ticks == 50
+
+
+def random_commands(rng: random.Random) -> dict[int, Command]:
+    """Returns commands at random ticks of a run of 0.9 s."""
+    kinds: tuple[Callable[[], Command], ...] = (
+        Reset,
+        Reset,
+        lambda: Couple(rng.uniform(300.0, 3000.0), rng.uniform(0.1, 1.0)),
+        lambda: Switch(force=rng.random() < 0.5),
+        lambda: Switch(clutch=rng.random() < 0.5),
+    )
+    return {rng.randint(1, 800): rng.choice(kinds)() for _ in range(rng.randint(1, 8))}
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_commands_at_random_are_repeated_bit_for_bit(run: Callable[..., Any], seed: int) -> None:
+    # of 150 seeds 14 were invalid while a reset left the handle's origin where it was: with the
+    # hand at rest the handle jumped back once the force had risen
+    rng = random.Random(seed)
+    rests_from = rng.choice([0, 100, 300, 900])
+    options = {
+        "method": rng.choice(["lossless", "implicit", "compensated"]),
+        "pipelined": rng.random() < 0.3,
+    }
+    if rng.random() < 0.3:
+        options["scene_rate"] = 250.0
+    script = Script(random_commands(rng), is_refused=True)
+    _, path, _ = run({}, 0.9, pose=lambda k: swaying(min(k, rests_from)), on_tick=script, **options)
+    report = audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+def test_a_reset_under_a_hand_at_rest_does_not_throw_it(run: Callable[..., Any]) -> None:
+    _, path, _ = run({200: Reset()}, 0.9, pose=lambda k: swaying(min(k, 100)))
+    ticks = read_recording(path).ticks
+    (reset,) = (e["tick"] for e in read_recording(path).events if e["event"] == "reset")
+    assert not np.ptp(ticks["handle_position"][reset:], axis=0).any()
+    assert ticks["lever"][-1] == 1.0

@@ -316,7 +316,13 @@ def unheeded() -> Iterator[list[int]]:
 
 @SIGNALS
 @pytest.mark.parametrize(
-    "moment", ["run.session.prepare", "run.bridge.Bridge.run", "run.bridge.Bridge.__exit__"]
+    "moment",
+    [
+        "run.session.prepare",
+        "signals.Interrupts.hand_over",
+        "run.bridge.Bridge.run",
+        "run.bridge.Bridge.__exit__",
+    ],
 )
 def test_a_signal_before_and_after_the_loop_ends_the_run_cleanly(
     name: str,
@@ -337,7 +343,7 @@ def test_a_signal_before_and_after_the_loop_ends_the_run_cleanly(
     monkeypatch.setattr(f"hapticbridge.{moment}", signalled)
     code, out, err = call("run", "point_mass", "--fast", "--duration", 0.01, "--record", path)
     assert device.is_closed and not np.any(device.writes) and not unheeded
-    if moment in {"run.session.prepare", "run.bridge.Bridge.run"}:  # before the first tick
+    if not moment.endswith("__exit__"):  # before the first tick
         ending = *STOPS[name], ""
         assert (code, err.splitlines()[-1], out) == ending
         assert not path.exists()

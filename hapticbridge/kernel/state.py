@@ -52,6 +52,7 @@ from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
 from hapticbridge.kernel.force_level import LEVEL_DTYPE, bind_level
 from hapticbridge.kernel.handle import (
     POSE_DTYPE,
+    anchor_handle,
     bind_poses,
     follow_handle,
     handle_facts,
@@ -319,6 +320,7 @@ class BoundKernel:
         observe_reset(s)
         direct(credit_springs, s)(s)
         if self._loop is None:
+            direct(anchor_handle, s["pose"])(s["pose"])  # also if the device stays at rest
             let_go(s["guard"])
         if s["run"]["scheme"] == Scheme.MIDPOINT:
             direct(restart_lossless, s)(s)

@@ -36,8 +36,8 @@ Findings, for translation and rotation each; E is 8 mJ at a limit of 10 N or 0.5
     quartered; again for each E_s >= E.
     slammed: w and v are the ones of every tick above 25 Hz, sums are over 0.3 s, w_d is the force
     of d earlier. b Σ v² − Σ w·v is 6.4 mW or more on average over 0.3 s, at a limit of 10 N or 0.5
-    N m, and 90 % of that average now, since a single blow is forgotten; and Σ w_d·v >= 1.1 b Σ v²
-    for a d of 1 or 2 ms, each for 0.25 s. r is halved. No hand swings so fast, and a force that
+    N m, and 80 % of that average now, since a single blow is forgotten; and Σ w_d·v >= 0.9 b Σ v²
+    for a d of 1 or 2 ms, each for 0.385 s. r is halved. No hand swings so fast, and a force that
     acts later explains the motion, so it did. d begins at a stated delay, whose w_d also replaces w
     if it gives more work. Blows on a stop of the device lack energy, too, but no force explains
     them. Of an unknown damping b = 0 counts.
@@ -153,11 +153,14 @@ STEPS, STEP = 3.0, 0.5
 """Number of steps for a finding, and the least share of the limit that a step is worth; no unit. A
 lower share takes steps of 0.2 mm at 2400 N/m and a limit of 2 N, which can be felt, for a fault."""
 
-SLAM, GOES_ON, EXPLAINED, LASTS = 0.8, 0.9, 1.1, 0.25
+SLAM, GOES_ON, EXPLAINED, LASTS = 0.8, 0.8, 0.9, 0.385
 """Least missing power of a slam in E per s, least share of its average that is missing now, least
 ratio of a later force's work to b Σ v², and time in s for which all hold. A lower ``SLAM`` takes
-swings of an encoder with steps of 0.2 mm for slams; lower shares and times take the ringing of
-stiff hands, or blows on a stop. All of these last for up to 0.19 s, and true swings go on."""
+swings of an encoder with steps of 0.2 mm for slams. After one blow the missing power falls as
+exp(−t/M), with M the memory of 0.3 s, and its average as (t/M) exp(−t/M): the share is kept for
+M/0.8 = 0.375 s, and ``LASTS`` is longer, so that a thrown hand that rings is no slam. In a swing
+that a force d late drives for ever, its work is (b + c) Σ v², with c the hand's damping; a hand of
+0.06 N s/m has a ratio of 1.02. A lower one takes blows on a stop for slams."""
 
 SENT_LAGS, SWUNG = (0.0, 0.0, 0.001, 0.002), 25.0
 """Ages of forces in s, all but the first beyond a stated delay, and corner in Hz of their filter. A

@@ -413,6 +413,8 @@ class Session:
         ``error`` is the exception that ended the run; None without one.
         """
         self.is_open = False
+        if not self.tick and (self.signal or isinstance(error, KeyboardInterrupt)):
+            self._is_begun = False
         is_failed = error is not None and self.last_trip is None
         self.event(
             "stop",
@@ -448,9 +450,8 @@ class Session:
             self.event("finding", sentence=sentence)
 
     def _close_stream(self) -> None:
-        """Finishes the recording, or removes it if start-up failed or a signal came before."""
-        is_discarded = not self._is_begun or (not self.tick and bool(self.signal))
-        self.stream.close(is_discarded=is_discarded)
+        """Finishes the recording, or removes that of a run that never began."""
+        self.stream.close(is_discarded=not self._is_begun)
 
     def begin(self, duration: float | None) -> None:
         """Sets the end of a run and its event; a later run starts with a ramp of the force.
