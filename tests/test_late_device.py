@@ -1,7 +1,6 @@
 """Devices that answer late or in steps: their conditions, against loops and energies of their own.
 
-The ledger here is exact and shares nothing with the package: hand and device are solved between
-two samples by matrix exponentials, and the hand's energy is what it stores and burns.
+The ledger is that of ``OwnDevice``, which shares nothing with the package.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ import pytest
 from audit_cases import ScriptedDevice, SlowClock, recorded, stroke
 from golden_cases import LIGHT
 from numpy.typing import NDArray
+from own_device import OwnDevice
 from scipy.linalg import expm
 
 from hapticbridge.audit import audit
@@ -28,9 +27,8 @@ from hapticbridge.demand.certificate import conditions_of, default_coupling
 from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.loop_setting import LoopSetting
 from hapticbridge.demand.methods import default_method
-from hapticbridge.device import DeviceInfo, Hand, Motion, SimulatedDevice, open_device
+from hapticbridge.device import Hand, Motion, SimulatedDevice, open_device
 from hapticbridge.errors import SafetyTrip
-from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.summary import Summary
@@ -252,109 +250,6 @@ def test_the_default_coupling_of_a_late_device_is_stiffer_than_a_walls_rule() ->
 # In the product: a device that gives a sample every n ticks, and holds its force from t_d on
 
 
-class OwnDevice:
-    """A device of 1 axis in a hand of spring and damper, solved exactly between two ticks.
-
-    ``got`` is the energy in J that the hand stored and burned beyond its start's, ``gained`` the
-    largest so far.
-
-    Args:
-        hand: Stiffness in N/m and damping in N s/m of the hand.
-        every: Ticks per sample; in the others the device holds its force.
-        is_new: True for the number of a tick with a sample, in place of ``every``.
-        late: Ticks from a sample to its force, by the sample's number; a part of one, too.
-        mass: Of hand and handle in kg.
-        step: Of its encoder in m; 0 reads exactly.
-        start: Displacement in m and speed in m/s of the hand.
-        sheet: Fields of the data sheet.
-    """
-
-    def __init__(
-        self,
-        hand: tuple[float, float],
-        *,
-        every: int = 1,
-        is_new: Callable[[int], bool] | None = None,
-        late: Callable[[int], float] = lambda _: 0.0,
-        mass: float = 0.1,
-        step: float = 0.0,
-        start: tuple[float, float] = (1e-3, 0.05),
-        **sheet: Any,
-    ) -> None:
-        usual: dict[str, Any] = {
-            "name": "own",
-            "axes": ("x", "y", "z"),
-            "mass": 0.1,
-            "damping": 2.0,
-            "delay": 0.0,
-        }
-        self.info = DeviceInfo(**usual | {"force_limit": 10.0, "is_real": False} | sheet)
-        self._is_new = is_new or (lambda tick: tick % every == 0)
-        self.late, self.mass, self._begin = late, mass, start
-        self.stiffness, self.damping = hand
-        self.step, self.got, self.gained = step, 0.0, 0.0
-
-    def start(self, period: float) -> NDArray[np.void]:
-        b = float(self.info.damping or 0.0) + self.damping
-        motion = [[0, 1, 0], [-self.stiffness / self.mass, -b / self.mass, 1 / self.mass]]
-        self._motion, self._period = np.array([*motion, [0, 0, 0]]), period
-        self._exact = cache(self._solved)
-        self._state = np.array([*self._begin, 0.0])  # displaced and moving
-        self._start = self._stored()
-        self._burned, self._ticks = 0.0, 0
-        self._forces: list[tuple[float, float]] = []  # when they act, in ticks, and their size
-        self._sample = np.zeros(1, SAMPLE_DTYPE)
-        self._sample["quaternion"][0, 0] = 1.0
-        self._sample["position"][0, 0] = self._place()
-        return self._sample
-
-    def _place(self) -> float:
-        x = float(self._state[0])
-        return self.step * round(x / self.step) if self.step else x
-
-    def _solved(self, share: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Returns the step of a share of a tick, and ∫ v² dt over it as a form of the state."""
-        time, square = share * self._period, np.diag([0.0, 1.0, 0.0])
-        # Van Loan 1978
-        blocks = [[-self._motion.T, square], [np.zeros((3, 3)), self._motion]]
-        block = expm(time * np.block(blocks))
-        return block[3:, 3:], block[3:, 3:].T @ block[:3, 3:]
-
-    def _stored(self) -> float:
-        x, v, _ = self._state
-        return 0.5 * self.mass * float(v) ** 2 + 0.5 * self.stiffness * float(x) ** 2
-
-    def _move(self, share: float) -> None:
-        if share > 0.0:
-            step, square = self._exact(share)
-            self._burned += self.damping * float(self._state @ square @ self._state)
-            self._state = step @ self._state
-
-    def read(self, sample: NDArray[np.void]) -> int:
-        now = float(self._ticks)
-        self._ticks += 1
-        while self._forces and self._forces[0][0] < self._ticks:
-            at, force = self._forces.pop(0)
-            self._move(round(max(at - now, 0.0), 9))
-            now, self._state[2] = max(at, now), force
-        self._move(round(self._ticks - now, 9))
-        self.got = self._stored() + self._burned - self._start
-        self.gained = max(self.gained, self.got)
-        is_new = self._is_new(self._ticks)
-        if is_new:
-            self._sample["position"][0, 0] = self._place()
-        sample[:] = self._sample
-        return 0 if is_new else int(TickFlag.STALE_SAMPLE)
-
-    def write(self, wrench: NDArray[np.float64]) -> None:
-        if self._is_new(self._ticks):
-            self._forces.append((self._ticks + self.late(self._ticks), float(wrench[0])))
-            self._forces.sort(key=lambda each: each[0])
-
-    def close(self) -> None:
-        pass
-
-
 def run(
     device: OwnDevice, coupling: Coupling | None, file: Path | None = None, **more: Any
 ) -> Summary:
@@ -478,26 +373,6 @@ def test_a_device_that_delivers_less_than_it_states_hears_it_once(
     assert summary.is_certified is report.certified is True
     for text in (str(summary), report.timekeeping.remark):
         assert text.count(found) == text.count(remedy) == (share < 1.0)
-
-
-@pytest.mark.parametrize("late", [0.25, 1.0, 1.5, 3.0, 8.0])
-def test_a_late_device_that_is_certified_gives_no_energy(late: float) -> None:
-    rng, certified = np.random.default_rng(int(100 * late)), 0
-    for scene in ("virtual_wall", "point_mass") * 3:
-        device = OwnDevice(
-            (10 ** rng.uniform(0, 4), 10 ** rng.uniform(-1, 0.5)),
-            late=lambda _: late,
-            mass=10 ** rng.uniform(-1.3, 0),
-            start=(rng.uniform(0, 5e-3), rng.uniform(0, 0.5)),
-            delay=late * T,
-        )
-        ratio = T * 10 ** rng.uniform(-1, 1)
-        most = 0.999 * 2.0 / needed(1.0, ratio, math.ceil(late))
-        law = Coupling(most, ratio * most, 1e-3 * most, 1e-3 * ratio * most)
-        summary = run(device, default_method().requested_coupling(law, T), scene=scene)
-        certified += summary.is_certified is True
-        assert device.gained < 1e-6
-    assert certified >= 4
 
 
 def test_a_walls_rule_fails_behind_a_delay_and_is_not_certified(tmp_path: Path) -> None:
