@@ -13,6 +13,7 @@ from audit_cases import ScriptedDevice
 from faults.catalogue import FINGERS
 from model_runs import LOOP_SCENES
 from numpy.typing import NDArray
+from own_device import OwnDevice
 from random_hands import random_motion
 from swing_cases import (
     ALARM,
@@ -25,7 +26,6 @@ from swing_cases import (
     shakes,
     taps,
 )
-from test_late_device import OwnDevice
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
