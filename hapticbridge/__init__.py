@@ -1,4 +1,4 @@
-"""Feel a MuJoCo scene through a haptic device, and know on which conditions it cannot kick back.
+"""Feel a MuJoCo scene through a haptic device, and know under which conditions it cannot kick back.
 
 with hapticbridge.Bridge("peg_in_hole", "simulated", recording="run.mcap") as bridge:
     summary = bridge.run(duration=10.0)

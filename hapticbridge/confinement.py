@@ -63,10 +63,10 @@ LONGEST = 4e5
 """Largest processor time in s of a child; one without limits has it. No film takes four days, and
 the kernel waits up to 2e6 s, ``SHARE`` times as long. A child that hangs ends then."""
 
-LARGEST_FILE, MAX_FILES = 256 << 20, 256
+MAX_FILE, MAX_FILES = 256 << 20, 256
 """Size in bytes of a file that the child may write, and number of files it may have open."""
 
-LARGEST_ANSWER = 1 << 29
+MAX_ANSWER = 1 << 29
 """Bytes that a child may hand back. Every instant of ten minutes of a large scene takes 100 MB."""
 
 
@@ -288,13 +288,13 @@ class Confined:
         if sys.platform == "win32":
             self._prepare()
             return self._work(Unlimited(hear))
-        room = LARGEST_ANSWER
+        room = MAX_ANSWER
         while frame := self._read(_FRAME.size):
             kind, size, rest = _FRAME.unpack(frame)
             room -= size + rest
             if room < 0 or kind > _FAILED:
                 raise ForeignSceneError(
-                    f"{self._what} gives more than {LARGEST_ANSWER >> 20} MB of results"
+                    f"{self._what} gives more than {MAX_ANSWER >> 20} MB of results"
                 )
             try:
                 found = unpacked(self._read(size), self._read(rest))
@@ -468,7 +468,7 @@ def confine(
     if sys.platform == "win32":
         return {}
     _limit_memory(memory)
-    _lower(resource.RLIMIT_FSIZE, LARGEST_FILE)
+    _lower(resource.RLIMIT_FSIZE, MAX_FILE)
     _lower(resource.RLIMIT_NOFILE, MAX_FILES)
     _lower(resource.RLIMIT_CORE, 0)
     allow_time(COMPILE_TIME)

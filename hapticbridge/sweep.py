@@ -386,14 +386,14 @@ WORKER_DIED = "WorkerDied: its process ended twice while it computed this point"
 _CHUNKS_PER_CORE = 32
 """Tasks per core by default. A kill then costs at most 3 % of a sweep."""
 
-_LARGEST_CHUNK = 256
+_MAX_CHUNK = 256
 """Largest number of points per task. Above it, sending and writing cost less than 10 µs per
 point."""
 
 _IN_FLIGHT = 64
 """Tasks in flight on an executor of unknown size. Further workers would idle."""
 
-_LONGEST_ERROR = 1000
+_MAX_ERROR = 1000
 """Largest number of characters of an error that are kept."""
 
 _PATIENCE = 3.0
@@ -461,7 +461,7 @@ def sweep(
     report = progress or (lambda _done, _all: None)
     report(len(done), len(wanted))
     missing = [point for key, point in wanted.items() if key not in done]
-    size = chunk or min(_LARGEST_CHUNK, math.ceil(len(missing) / (_CHUNKS_PER_CORE * cores())))
+    size = chunk or min(_MAX_CHUNK, math.ceil(len(missing) / (_CHUNKS_PER_CORE * cores())))
     chunks = deque(missing[start : start + size] for start in range(0, len(missing), size or 1))
 
     def rows() -> Table:
@@ -610,7 +610,7 @@ def _failure(error: BaseException) -> Outcome:
     """Returns the outcome of a failed point: type and message of its error."""
     text = f"{type(error).__name__}: {error}"
     # a lone surrogate has no bytes and could not be written
-    return Outcome({}, text[:_LONGEST_ERROR].encode(errors="backslashreplace").decode())
+    return Outcome({}, text[:_MAX_ERROR].encode(errors="backslashreplace").decode())
 
 
 def _name_of(function: Callable[[Any], Any]) -> str:

@@ -13,7 +13,7 @@ from hapticbridge.check import cost as costs
 from hapticbridge.check.case import samples_of
 from hapticbridge.check.cost import Cost, measure_cost
 from hapticbridge.coupling import Coupling
-from hapticbridge.demand.rehearsal import Setting
+from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
 from hapticbridge.scene import load_scene, scene_path
@@ -63,10 +63,10 @@ def cost_of_wall(
     scene = load_scene(wall)
     samples = samples_of(motion, 1e-3)
     if clock is None:
-        return measure_cost(scene, samples, Setting(COUPLING))
+        return measure_cost(scene, samples, RunPoint(COUPLING))
     if plant is not None:
         plant(clock)  # not before: MuJoCo's compiler calls some of it too
-    return measure_cost(scene, samples, Setting(COUPLING, contact="scene"), clock=clock.pythons)
+    return measure_cost(scene, samples, RunPoint(COUPLING, contact="scene"), clock=clock.pythons)
 
 
 def changed(cost: Cost) -> dict[str, tuple[float, float]]:
@@ -144,7 +144,7 @@ def test_what_the_bridge_adds_to_the_step_is_its_own_line(clock: PlantedClock) -
 
     scene = load_scene("point_mass")
     motion = Motion([0, 0.2], [(0, 0, 0), (0.01, 0, 0)])
-    cost = measure_cost(scene, samples_of(motion, 1e-3), Setting(COUPLING), clock=pythons)
+    cost = measure_cost(scene, samples_of(motion, 1e-3), RunPoint(COUPLING), clock=pythons)
     assert changed(cost).keys() == {costs.BRIDGE}
     assert changed(cost)[costs.BRIDGE][0] == pytest.approx(4)
     assert cost.contact.ticks == 0
@@ -183,4 +183,4 @@ def test_motion_that_ends_in_nothing_finite_is_an_error() -> None:
     samples = samples_of(Motion([0, 0.2], [(0, 0, 0), (0.01, 0, 0)]), 1e-3)
     samples["position"][100] = np.nan
     with pytest.raises(SceneError, match="not finite after tick 100"):
-        measure_cost(scene, samples, Setting(COUPLING))
+        measure_cost(scene, samples, RunPoint(COUPLING))

@@ -36,7 +36,7 @@ from hapticbridge.check.run_faults import run_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS, Simplification
 from hapticbridge.check.version import SceneVariant, name_everything, witness
 from hapticbridge.coupling import Coupling
-from hapticbridge.demand.rehearsal import Setting
+from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import Motion
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.scene import compile_scene, read_scene, scene_names, scene_path
@@ -369,7 +369,7 @@ def test_floor_under_a_flex_is_not_called_idle(tmp_path: Path) -> None:
     inventory = take_inventory(case.model, "grip", case.places, case.observation)
     assert inventory.flexes == 1
     assert not inventory.idle
-    draft = SceneVariant(case.source, "grip", Setting(case.coupling))
+    draft = SceneVariant(case.source, "grip", RunPoint(case.coupling))
     assert "floor" in witness(draft, case.motion).near_geoms
 
 
@@ -410,7 +410,7 @@ def lean_by(
     patch.setattr(lean, "all_simplifications", lambda *_: taken)
     told, still = iter(costs), Motion([0.0, 0.1], [(0, 0, 0)] * 2)
     source = read_scene(written(folder, mjcf(GOOD_OPTION, GOOD_CONTACT, body=BALL)))
-    setting = Setting(Coupling(2400.0, 0.5, 2.4, 5e-4))
+    setting = RunPoint(Coupling(2400.0, 0.5, 2.4, 5e-4))
     cost = lambda *_: (1.0, next(told, costs[-1]))  # noqa: E731
     return lean.find_lean(SceneVariant(source, "grip", setting), still, cost=cost)
 

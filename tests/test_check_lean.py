@@ -18,7 +18,7 @@ from over_modelled import ITERATIONS, over_modelled_peg
 
 from hapticbridge.check import lean
 from hapticbridge.check.case import motion_for
-from hapticbridge.check.cost import CHUNKS, Stage, one_pass, processor_costs
+from hapticbridge.check.cost import CHUNKS, VariantRun, one_pass, processor_costs
 from hapticbridge.check.lean import IS_FELT, MAY_GO, Judge, Lean, find_lean
 from hapticbridge.check.lean_output import lean_facts, write_lean
 from hapticbridge.check.perception import felt_error
@@ -30,7 +30,7 @@ from hapticbridge.check.simplify import (
 from hapticbridge.check.version import SceneVariant, name_everything, witness
 from hapticbridge.cli import main
 from hapticbridge.coupling import Coupling
-from hapticbridge.demand.rehearsal import Setting
+from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
 from hapticbridge.scene import load_scene, read_scene
@@ -70,7 +70,7 @@ def found() -> Lean:
     # four times as fast as the path on which the outcome is judged, to save time
     motion = own_motion("peg_in_hole", speed=4.0)
     return find_lean(
-        SceneVariant(over_modelled_peg(), "grip", Setting(COUPLING)), motion, cost=planted
+        SceneVariant(over_modelled_peg(), "grip", RunPoint(COUPLING)), motion, cost=planted
     )
 
 
@@ -125,7 +125,7 @@ def test_smaller_budget_takes_less(found: Lean, monkeypatch: pytest.MonkeyPatch)
     chosen = lambda *told: [each for each in every(*told) if each.name in two]  # noqa: E731
     monkeypatch.setattr(lean, "all_simplifications", chosen)
     how: Any = {"budget": 0.01, "cost": planted}
-    strict = find_lean(SceneVariant(over_modelled_peg(), "grip", Setting(COUPLING)), motion, **how)
+    strict = find_lean(SceneVariant(over_modelled_peg(), "grip", RunPoint(COUPLING)), motion, **how)
     verdicts = {trial.name: trial.verdict for trial in strict.alone}
     assert verdicts == {"primitives": IS_FELT, "usual tolerance": MAY_GO}
 
@@ -160,7 +160,7 @@ def free_draft(tmp_path: Path, extra: str = "", body: str = TOOL) -> SceneVarian
     text = mjcf('<option gravity="0 0 0"/>', body=body).replace("</mujoco>", f"{extra}</mujoco>")
     source = read_scene(scene_file(tmp_path, text))
     name_everything(source.spec)
-    return SceneVariant(source, "grip", Setting(COUPLING))
+    return SceneVariant(source, "grip", RunPoint(COUPLING))
 
 
 def freedoms(draft: SceneVariant, motion: Motion) -> dict[str, Callable[[SceneVariant], bool]]:
@@ -263,7 +263,9 @@ def lean_of(path: Path) -> Lean:
     down = np.zeros((21, 3))
     down[:, 2] = -0.004 * np.sin(np.linspace(0, np.pi, 21))
     motion = Motion(np.linspace(0, 0.5, 21), down)
-    return find_lean(SceneVariant(read_scene(path), "tip", Setting(COUPLING)), motion, cost=planted)
+    return find_lean(
+        SceneVariant(read_scene(path), "tip", RunPoint(COUPLING)), motion, cost=planted
+    )
 
 
 def test_scene_with_includes_and_meshes_is_written_elsewhere(with_files: Path) -> None:
@@ -314,16 +316,16 @@ def test_facts_hold_every_trial_by_name(found: Lean) -> None:
 def test_processor_time_of_more_work_is_more_and_both_are_positive() -> None:
     """No time is asserted: a hundred substeps are simply more than one."""
     source = read_scene("virtual_wall")
-    light = SceneVariant(source, "grip", Setting(COUPLING))
-    heavy = SceneVariant(source, "grip", Setting(COUPLING, substeps=100))
+    light = SceneVariant(source, "grip", RunPoint(COUPLING))
+    heavy = SceneVariant(source, "grip", RunPoint(COUPLING, substeps=100))
     costs = processor_costs(light, heavy, own_motion("virtual_wall", 0.1))
     assert 0.0 < costs[0] < costs[1]
 
 
 def test_motion_is_timed_whole_and_as_it_is_rehearsed() -> None:
-    draft = SceneVariant(read_scene("virtual_wall"), "grip", Setting(COUPLING))
+    draft = SceneVariant(read_scene("virtual_wall"), "grip", RunPoint(COUPLING))
     motion = own_motion("virtual_wall", 1.2)
-    stages = [Stage(draft, motion) for _ in range(2)]
+    stages = [VariantRun(draft, motion) for _ in range(2)]
     for _ in range(2):  # the second time from the start again
         assert one_pass(stages).shape == (2, CHUNKS)
     for stage in stages:
@@ -350,7 +352,10 @@ def test_shipped_scenes_model_nothing_that_may_go(name: str) -> None:
     """
     source = read_scene(name)
     name_everything(source.spec)
-    draft, motion = SceneVariant(source, "grip", Setting(COUPLING)), own_motion(name, speed=3.0)
+    draft, motion = (
+        SceneVariant(source, "grip", RunPoint(COUPLING)),
+        own_motion(name, speed=3.0),
+    )
     judge = Judge(draft, motion, 0.1, 2.0, planted)
     seen, trials = witness(draft, motion), []
     shapes = *contact_simplifications(seen), *shape_simplifications()
@@ -370,7 +375,7 @@ def test_progress_ends_and_where_nothing_may_go_nothing_is_written(tmp_path: Pat
     told: list[tuple[float, float, str]] = []
     source, motion = read_scene("virtual_wall"), own_motion("virtual_wall", 2.0)
     how: Any = {"cost": lambda *_: (1.0, 1.0), "progress": lambda *news: told.append(news)}
-    lean = find_lean(SceneVariant(source, "grip", Setting(COUPLING)), motion, **how)
+    lean = find_lean(SceneVariant(source, "grip", RunPoint(COUPLING)), motion, **how)
     done = [part for part, _, _ in told]
     assert (done, done[-1]) == (sorted(done), told[-1][1])
     assert lean.together == ()

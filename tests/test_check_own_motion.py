@@ -8,7 +8,7 @@ from cli_cases import Called
 
 from hapticbridge.check.case import open_case
 from hapticbridge.check.findings import own_motion_faults
-from hapticbridge.demand.rehearsal import Setting
+from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.kernel.ledger import ENERGY_TOLERANCE
 from hapticbridge.run.own_motion import NO_HAND, NOTABLE_ENERGY, OwnMotion, own_motion, own_substeps
 from hapticbridge.scene import SceneSource, compile_scene, read_scene
@@ -42,7 +42,7 @@ def scene(folder: Path, text: str) -> SceneSource:
 
 
 def moved(source: SceneSource, substeps: int = 1) -> OwnMotion:
-    found = own_motion(source, compile_scene(source), Setting(NO_HAND, PERIOD, substeps))
+    found = own_motion(source, compile_scene(source), RunPoint(NO_HAND, PERIOD, substeps))
     assert found is not None
     return found
 
@@ -56,9 +56,9 @@ def test_a_swing_that_the_file_damps_by_its_own_step_is_seen(tmp_path: Path) -> 
     found = moved(scene(tmp_path, SWING.format(step=0.01, integrator="implicitfast")))
     assert found.jnd > 5.0
     assert found.body == "swing"
-    assert "--rate 100" in found.remedy(Setting(NO_HAND, PERIOD))
-    assert "--contact scene" in found.remedy(Setting(NO_HAND, 0.01))
-    assert "--substeps" in found.remedy(Setting(NO_HAND, 0.01, contact="scene"))
+    assert "--rate 100" in found.remedy(RunPoint(NO_HAND, PERIOD))
+    assert "--contact scene" in found.remedy(RunPoint(NO_HAND, 0.01))
+    assert "--substeps" in found.remedy(RunPoint(NO_HAND, 0.01, contact="scene"))
     for step in (0.0002, 0.001):
         assert moved(scene(tmp_path, SWING.format(step=step, integrator="RK4"))).jnd < 0.1
 
@@ -88,7 +88,7 @@ def test_a_tool_that_falls_over_when_it_is_let_go_is_no_fault(tmp_path: Path) ->
         '<site name="held"/></body></worldbody>',
     )
     source = scene(tmp_path, other)
-    found = own_motion(source, compile_scene(source, "held"), Setting(NO_HAND, PERIOD))
+    found = own_motion(source, compile_scene(source, "held"), RunPoint(NO_HAND, PERIOD))
     assert found is not None
     assert (found.body, found.jnd > 1.0) == ("stick", True)
 
@@ -96,18 +96,18 @@ def test_a_tool_that_falls_over_when_it_is_let_go_is_no_fault(tmp_path: Path) ->
 def test_a_short_step_is_kept_where_the_scene_needs_it(tmp_path: Path) -> None:
     needs = scene(tmp_path, FILTER)
     assert moved(needs).jnd > 1.0
-    substeps, found = own_substeps(needs, compile_scene(needs), Setting(NO_HAND, PERIOD))
+    substeps, found = own_substeps(needs, compile_scene(needs), RunPoint(NO_HAND, PERIOD))
     assert substeps == 10
     assert found is not None
     assert found.jnd < 1.0
     does_not = scene(tmp_path, SWING.format(step=0.0002, integrator="RK4"))
-    assert own_substeps(does_not, compile_scene(does_not), Setting(NO_HAND, PERIOD))[0] == 1
+    assert own_substeps(does_not, compile_scene(does_not), RunPoint(NO_HAND, PERIOD))[0] == 1
 
 
 def test_a_scene_that_diverges_by_itself_has_nothing_to_respect(tmp_path: Path) -> None:
     text = FILTER.replace('"0.0001"', '"0.002"')
     diverges = scene(tmp_path, text)
-    assert own_motion(diverges, compile_scene(diverges), Setting(NO_HAND, PERIOD)) is None
+    assert own_motion(diverges, compile_scene(diverges), RunPoint(NO_HAND, PERIOD)) is None
 
 
 def test_run_keeps_the_short_step(call: Called, tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_energy_that_fast_joints_create_beside_contacts_of_the_scene_is_told(
         springref="-.5"/><geom size=".02" mass=".1"/></body>"""
     text = SPINNING.format(8, 20).replace("</worldbody>", pressed + "</worldbody>")
     source = scene(tmp_path, text.replace("0 0 0 0 0 0", 7 * "0 ").replace("1 0 0 0", "1 0 0 0 0"))
-    setting = Setting(NO_HAND, PERIOD, contact="scene")
+    setting = RunPoint(NO_HAND, PERIOD, contact="scene")
     found = own_motion(source, compile_scene(source), setting)
     assert found is not None
     assert found.created > NOTABLE_ENERGY

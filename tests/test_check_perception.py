@@ -15,7 +15,7 @@ from hapticbridge.check.lean import find_lean
 from hapticbridge.check.perception import FORCE_FLOOR, LEVER, WEBER, felt_error
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.coupling import Coupling
-from hapticbridge.demand.rehearsal import Setting
+from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.kernel.record import TICK_DTYPE
@@ -57,7 +57,7 @@ def test_spring_seven_percent_stiffer_is_one_just_noticeable_difference(tmp_path
           <joint type="slide" axis="1 0 0" stiffness="{stiffness!r}"/>
           <geom size="0.01" mass="0.01"/><site name="grip"/></body></worldbody></mujoco>"""
         source = read_scene(scene_file(tmp_path, text))
-        done.append(SceneVariant(source, "grip", Setting(coupling)).rehearsed(Motion(time, path)))
+        done.append(SceneVariant(source, "grip", RunPoint(coupling)).rehearsed(Motion(time, path)))
     felt = felt_error(done[0].records, done[1].records)
     # 10 g swing with 0.05 N at most beside 3.8 N, and damping adds as little
     assert felt.jnd == pytest.approx(1.0, abs=0.01)
@@ -111,7 +111,7 @@ def test_what_is_not_one_motion_and_bad_budgets_are_refused() -> None:
     for ticks, words in ((0, "nothing to compare"), (400, "500 and 400 ticks are not of the same")):
         with pytest.raises(SceneError, match=words):
             felt_error(rows, rows[:ticks])
-    source, setting = read_scene("virtual_wall"), Setting(Coupling(2400.0, 0.5, 2.4, 5e-4))
+    source, setting = read_scene("virtual_wall"), RunPoint(Coupling(2400.0, 0.5, 2.4, 5e-4))
     short, motion = (Motion(np.array([0.0, end]), np.zeros((2, 3))) for end in (1e-4, 1.0))
     with pytest.raises(SceneError, match="less than one tick"):
         find_lean(SceneVariant(source, "grip", setting), short)

@@ -19,14 +19,14 @@ from hapticbridge.check.lean import IS_FELT, MAY_GO, Judge, VariantVerdict
 from hapticbridge.check.simplify import Simplification
 from hapticbridge.check.version import CLEARANCE, SceneVariant, name_everything, witness
 from hapticbridge.coupling import Coupling
-from hapticbridge.demand.rehearsal import Setting
+from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.scene import read_scene
 
 COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
-OWN_CONTACT = Setting(COUPLING, contact="scene")
+OWN_CONTACT = RunPoint(COUPLING, contact="scene")
 OPTION = '<option gravity="0 0 0" cone="elliptic"/>'
 CONTACT = 'solref="0.002 1" solimp="0.9 0.95 0.001"'
 
@@ -60,14 +60,14 @@ def half_price(first: SceneVariant, second: SceneVariant, _: Motion) -> tuple[fl
     return 1.0, 1.0 if texts[0] == texts[1] else 0.5
 
 
-def draft_of(tmp_path: Path, text: str, setting: Setting | None = None) -> SceneVariant:
+def draft_of(tmp_path: Path, text: str, setting: RunPoint | None = None) -> SceneVariant:
     return variant(scene_file(tmp_path, text), setting)
 
 
-def variant(scene: str | Path, setting: Setting | None = None) -> SceneVariant:
+def variant(scene: str | Path, setting: RunPoint | None = None) -> SceneVariant:
     source = read_scene(scene)
     name_everything(source.spec)
-    return SceneVariant(source, "grip", setting or Setting(COUPLING))
+    return SceneVariant(source, "grip", setting or RunPoint(COUPLING))
 
 
 def judged(*arguments: Any, **options: Any) -> VariantVerdict:
@@ -173,7 +173,7 @@ def test_motion_that_a_scene_does_not_survive_is_refused(tmp_path: Path) -> None
     assert witness(draft_of(tmp_path, mjcf(OPTION, body=tool.format("1"))), up).near == set()
 
 
-def shipped(name: str, setting: Setting | None = None) -> tuple[SceneVariant, Motion]:
+def shipped(name: str, setting: RunPoint | None = None) -> tuple[SceneVariant, Motion]:
     draft = variant(name, setting)
     motion = motion_for(draft.compiled())
     assert motion is not None
@@ -305,7 +305,7 @@ def test_what_a_sensor_refers_to_is_not_taken_away(tmp_path: Path) -> None:
 
 
 def test_rate_goes_down_only_as_far_as_device_and_hand_allow(tmp_path: Path) -> None:
-    soft = Setting(Coupling(400.0, 0.3, 1.0, 6e-4))
+    soft = RunPoint(Coupling(400.0, 0.3, 1.0, 6e-4))
     free = mjcf(OPTION)
     aside = (0.03, 0, 0)
     slow, fast = (through((s, aside, NOWHERE), (s, NOWHERE, NOWHERE)) for s in (2.0, 0.08))
@@ -320,7 +320,7 @@ def test_rate_goes_down_only_as_far_as_device_and_hand_allow(tmp_path: Path) -> 
 
 
 def test_substeps_go_where_they_were_not_needed(tmp_path: Path) -> None:
-    setting = Setting(COUPLING, substeps=4)
+    setting = RunPoint(COUPLING, substeps=4)
     draft = draft_of(tmp_path, ball_on_floor(), setting)
     slow = through((1.0, (0.02, 0, 0.01), NOWHERE))
     assert judged(draft, slow, "1 substep").verdict == MAY_GO

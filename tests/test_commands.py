@@ -18,7 +18,7 @@ from hapticbridge.device import AXES
 from hapticbridge.errors import CommandError
 from hapticbridge.run.commands import (
     INTERVAL,
-    LONGEST_LINE,
+    MAX_LINE,
     MAX_WAITING,
     RESET_INTERVAL,
     Command,
@@ -199,7 +199,7 @@ def _json(value: object) -> bytes:
 
 
 @settings(max_examples=100)
-@given(st.binary(max_size=2 * LONGEST_LINE))
+@given(st.binary(max_size=2 * MAX_LINE))
 def test_any_bytes_are_a_command_or_refused(said: bytes) -> None:
     try:
         command = command_of(said)
@@ -223,7 +223,7 @@ def test_any_bytes_are_a_command_or_refused(said: bytes) -> None:
 )
 def test_a_command_reads_back_as_it_was_written(command: Command) -> None:
     assert command_of(line_of(command)) == command
-    assert len(line_of(command)) <= LONGEST_LINE
+    assert len(line_of(command)) <= MAX_LINE
 
 
 @pytest.mark.parametrize("substeps", [1, 4])

@@ -91,7 +91,7 @@ def test_nine_newton_along_the_axis_take_the_published_torque() -> None:
 def test_any_angles_give_a_place_within_reach_or_leave_it(angles: tuple[float, ...]) -> None:
     place = MIDDLE.copy()
     if kinematics.forward(np.array(angles), place):
-        assert math.hypot(place[0], place[1]) <= kinematics.LARGEST_RADIUS
+        assert math.hypot(place[0], place[1]) <= kinematics.MAX_RADIUS
         assert kinematics.NEAREST <= place[2] <= kinematics.FARTHEST
     else:
         assert place.tolist() == MIDDLE.tolist()

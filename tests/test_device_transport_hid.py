@@ -145,7 +145,7 @@ def test_of_each_kind_the_newest_report_is_sent_and_kinds_take_turns() -> None:
 
 
 def test_set_up_is_sent_at_once_and_what_waited_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transport_hid, "LONGEST_WRITE", 10.0)
+    monkeypatch.setattr(transport_hid, "MAX_WRITE", 10.0)
     gates: list[threading.Semaphore] = []
 
     class Opened(threading.Event):
@@ -185,7 +185,7 @@ def test_requests_that_fail_have_an_empty_answer() -> None:
 
 
 def test_a_device_that_takes_no_report_any_more_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transport_hid, "LONGEST_WRITE", 0.0)
+    monkeypatch.setattr(transport_hid, "MAX_WRITE", 0.0)
     handle, link = slow("stuck")
     link.write(b"a")
     handle.entered.acquire()

@@ -101,7 +101,7 @@ def test_a_value_that_is_written_is_read_back_and_nothing_else_moves(data: st.Da
     ("raw", "words"),
     [
         (b"", "a report descriptor has 0 bytes; it must have 1 to 4096"),
-        (bytes(hid.LONGEST_DESCRIPTOR + 1), "a report descriptor has 4097 bytes"),
+        (bytes(hid.MAX_DESCRIPTOR + 1), "a report descriptor has 4097 bytes"),
         (b"\x05", "ends within the item at byte 0"),
         (b"\x05\x01\x27\x01\x02", "ends within the item at byte 2"),
         (b"\xfe\x05", "ends within the item at byte 0"),

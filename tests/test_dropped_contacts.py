@@ -74,7 +74,7 @@ def plate(folder: Path, memory: int | None) -> Path:
 @pytest.fixture
 def file_decides(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Leaves a scene the memory that its file gives; returns the present folder, empty."""
-    monkeypatch.setattr("hapticbridge.scene.load.LEAST_MEMORY", 0)
+    monkeypatch.setattr("hapticbridge.scene.load.MIN_MEMORY", 0)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

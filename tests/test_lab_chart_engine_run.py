@@ -23,6 +23,7 @@ from hapticbridge.lab.chart.setting import OWN, Setting
 from hapticbridge.lab.chart.workload import PeerWork, Workload
 from hapticbridge.lab.engines import mujoco as mujoco_engine
 from hapticbridge.lab.engines.base import (
+    Advised,
     Body,
     Engine,
     FreeBody,
@@ -32,7 +33,6 @@ from hapticbridge.lab.engines.base import (
     composed,
     open_engine,
 )
-from hapticbridge.lab.engines.base import Setting as EngineSetting
 from hapticbridge.lab.methods import METHODS
 
 GRID, FINE = 4e-3, 1e-3
@@ -56,7 +56,7 @@ class Altered:
 
     name = "altered"
     version = "0"
-    settings: Mapping[str, EngineSetting] = {}
+    settings: Mapping[str, Advised] = {}
 
     def __init__(
         self,

@@ -558,7 +558,7 @@ def error_of(action: Callable[[], object]) -> int:
 def test_a_child_has_few_and_small_files_no_dump_and_no_descriptor_of_this_process(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(confinement, "LARGEST_FILE", 1 << 20)
+    monkeypatch.setattr(confinement, "MAX_FILE", 1 << 20)
     monkeypatch.setattr(confinement, "MAX_FILES", 64)
     libc = ctypes.CDLL(None, use_errno=True)
     io_uring_setup, get_death_signal = 425, 2

@@ -332,8 +332,8 @@ def test_a_recorder_that_takes_records_for_ever_is_left_too(
     recorder = started(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
     os.kill(recorder.pid, signal.SIGSTOP)
-    monkeypatch.setattr(recorder_module, "LONGEST_CLOSE", 0.1)
-    seconds = iter(np.arange(0.0, 10.0, recorder_module.LONGEST_CLOSE / 4))
+    monkeypatch.setattr(recorder_module, "MAX_CLOSE", 0.1)
+    seconds = iter(np.arange(0.0, 10.0, recorder_module.MAX_CLOSE / 4))
 
     def later() -> float:
         ring.cursors[TAIL] += 1  # a sign of life

@@ -239,7 +239,7 @@ def test_a_result_that_is_not_finite_trips() -> None:
 
 @pytest.mark.filterwarnings("ignore:a step of scene .point_mass.")
 def test_a_step_that_stands_still_keeps_no_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hapticbridge.run.slow_scene.LONGEST_WAIT", 0.1)
+    monkeypatch.setattr("hapticbridge.run.slow_scene.MAX_WAIT", 0.1)
     device, release = ScriptedDevice(still), threading.Event()
     bridge = Bridge("point_mass", device, COUPLING, scene_rate=100.0)
     began = time.monotonic()
@@ -276,7 +276,7 @@ def holding(bridge: Bridge) -> Held:
 
 
 def test_a_scene_is_left_alone_while_a_step_of_it_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hapticbridge.run.slow_scene.LONGEST_WAIT", 0.1)
+    monkeypatch.setattr("hapticbridge.run.slow_scene.MAX_WAIT", 0.1)
     scene, left = load_scene("peg_in_hole"), []
     bridge = Bridge(scene, ScriptedDevice(still), COUPLING, scene_rate=100.0)
     with pytest.warns(UserWarning, match="a step of scene 'peg_in_hole' still runs"), bridge:
@@ -294,7 +294,7 @@ def test_a_scene_is_left_alone_while_a_step_of_it_runs(monkeypatch: pytest.Monke
 def test_a_step_that_does_not_end_lets_the_force_go_until_it_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hapticbridge.run.slow_scene.LONGEST_WAIT", 0.3)
+    monkeypatch.setattr("hapticbridge.run.slow_scene.MAX_WAIT", 0.3)
     steps: list[Held] = []
 
     def act(bridge: Bridge, tick: int) -> None:

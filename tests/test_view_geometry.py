@@ -25,7 +25,7 @@ from hapticbridge.view.geometry import (
     props_of,
     shell,
 )
-from hapticbridge.view.page import LONGEST_ARROW, Ghost, Sight
+from hapticbridge.view.page import MAX_ARROW, Ghost, Sight
 
 Array = NDArray[np.float64]
 
@@ -209,7 +209,7 @@ def test_spring_and_arrow_point_to_where_the_hand_is_pulled(stretch: float) -> N
         np.testing.assert_allclose(end - start, (0, 0, ghost.times * stretch), atol=1e-6)
     tail, tip = canvas.__dict__["/force on the hand"].points[0]
     np.testing.assert_allclose(tail, end, atol=1e-6)
-    np.testing.assert_allclose(tip - tail, (0, 0, 0.5 * LONGEST_ARROW), atol=1e-6)
+    np.testing.assert_allclose(tip - tail, (0, 0, 0.5 * MAX_ARROW), atol=1e-6)
 
 
 @given(st.floats(1e-9, 10.0), st.floats(0.0, 10.0))

@@ -43,7 +43,7 @@ REASONS = {
     "realtime/doctor.py: wait()": "a clock's: at most one period",
     "kernel/machine_code.py: for line in sys.stdin": "the end of the process that asks closes it",
     # devices and their guardian
-    "device/transport/hid.py: self._wake.wait()": f"{DAEMON} longer than LONGEST_WRITE",
+    "device/transport/hid.py: self._wake.wait()": f"{DAEMON} longer than MAX_WRITE",
     "device/rawhid/serial.py: self._ports.sleep(PAUSE)": "until the time of its caller is over",
     "device/touch/device.py: self._time.sleep(0.001)": "its loop ends with a time",
     "device/touch/device.py: self._time.sleep(0.1 * CALIBRATION_TIME)": "its loop ends with a time",
@@ -63,7 +63,7 @@ REASONS = {
     "view/process.py: time.sleep(due - now)": "until the bridge closes its end, or is dead",
     "view/controls.py: time.sleep(pace)": DAEMON,
     "view/window.py: stream.readline()": DAEMON,
-    "view/window.py: stream.readline(LONGEST_LINE + 1)": DAEMON,
+    "view/window.py: stream.readline(MAX_LINE + 1)": DAEMON,
     "view/window.py: time.sleep(INTERVAL)": DAEMON,
     "view/window.py: time.sleep(HAND_INTERVAL)": DAEMON,
     "view/window.py: self._outbox.get()": DAEMON,

@@ -25,7 +25,7 @@ as the audit of two minutes at 1 kHz."""
 UNREADABLE = "unreadable"
 """Verdict on a file that is not a recording or cannot be read."""
 
-_LONGEST_REASON = 1000
+_MAX_REASON = 1000
 """Largest length of a reason in characters. A damaged file may have a problem in each chunk."""
 
 _UNITS = {
@@ -133,10 +133,10 @@ def audit_point(
             "margin": math.nan,
             "verdict": UNREADABLE,
             "exit_code": 2,
-            "reason": str(error)[:_LONGEST_REASON],
+            "reason": str(error)[:_MAX_REASON],
         }
     known: dict[str, Value] = {name: getattr(report, name) for name in _COLUMNS}
-    known["reason"] = report.reason[:_LONGEST_REASON]
+    known["reason"] = report.reason[:_MAX_REASON]
     known["environment"] = report.environment or ""
     known["certified"] = report.answer
     if report.damping_margin is not None:

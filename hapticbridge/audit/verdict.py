@@ -221,7 +221,7 @@ def verdict_words(verdict: str, environment: str, port: str) -> str:
 # End of a run
 
 
-LONGEST_WORDS = 500
+MAX_WORDS = 500
 """Largest number of characters of a text that is read from a foreign file."""
 
 _USUAL_ENDS = ("duration", "signal", "caller", BY_TRIP, None, "")
@@ -231,7 +231,7 @@ def unusual_end(trip: Trip | None, events: Sequence[Mapping[str, Any]]) -> str:
     """Returns a clause that names what ended the run; empty for an ordinary end."""
     clauses = []
     if trip is not None:
-        clauses.append(f"the guard tripped at tick {trip.tick}: {trip.words[:LONGEST_WORDS]}")
+        clauses.append(f"the guard tripped at tick {trip.tick}: {trip.words[:MAX_WORDS]}")
     for event in events:
         name, by = event.get("event"), event.get("error") or event.get("reason")
         if name == "bridge_died":
@@ -243,7 +243,7 @@ def unusual_end(trip: Trip | None, events: Sequence[Mapping[str, Any]]) -> str:
         elif name == "stop" and event.get("signal"):
             clauses.append(f"stopped by {event['signal']} at tick {event.get('tick')}")
         elif name == "stop" and trip is None and by not in _USUAL_ENDS:
-            clauses.append(f"stopped by {str(by)[:LONGEST_WORDS]}")
+            clauses.append(f"stopped by {str(by)[:MAX_WORDS]}")
     return "; ".join(clauses)
 
 
@@ -436,7 +436,7 @@ def verdict_on(
         ticks=recording.count,
         events=_event_counts(recording),
         findings=tuple(
-            str(event.get("sentence", ""))[:LONGEST_WORDS]
+            str(event.get("sentence", ""))[:MAX_WORDS]
             for event in recording.events
             if event.get("event") == "finding"
         ),

@@ -16,7 +16,7 @@ from hapticbridge.check.observe import Observation, observe
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.demand.methods import RIGID, default_method
-from hapticbridge.demand.rehearsal import Setting
+from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice, read_motion
 from hapticbridge.device.base import checked_number
 from hapticbridge.device.trajectory import DEFAULT_SECONDS, lissajous
@@ -81,7 +81,7 @@ def samples_of(motion: Motion, period: float) -> NDArray[np.void]:
 DEFAULT_PERIOD = 1e-3
 """Tick period T in s. It is the default of ``hapticbridge run``."""
 
-LARGEST_WORKSPACE = 0.4
+MAX_WORKSPACE = 0.4
 """Default edge in m of the cube that a device reaches. Makers of table-top devices state 0.1 m
 (Novint Falcon) to 0.4 m (Force Dimension delta.3), so a motion beyond it fits none of them. The
 simulated device has no walls."""
@@ -136,9 +136,9 @@ class SceneUnderCheck(CompiledScene):
         return self.contact == RIGID
 
     @property
-    def setting(self) -> Setting:
+    def setting(self) -> RunPoint:
         """Coupling, period and contact of the run."""
-        return Setting(self.coupling, self.period, contact=self.contact)
+        return RunPoint(self.coupling, self.period, contact=self.contact)
 
     @property
     def law(self) -> Coupling:
@@ -161,7 +161,7 @@ class IntendedUse:
     coupling: Coupling | None = None
     period: float | None = None
     scale: float = 1.0
-    workspace: float = LARGEST_WORKSPACE
+    workspace: float = MAX_WORKSPACE
     contact: Literal["rigid", "scene"] = "rigid"
 
 
@@ -197,7 +197,7 @@ def open_case(
     period = DEFAULT_PERIOD if use.period is None else use.period
     info = SimulatedDevice().info
     coupling = use.coupling or default_coupling(info, period, use.scale, use.scale)
-    setting = Setting(coupling, period, contact=use.contact)
+    setting = RunPoint(coupling, period, contact=use.contact)
     scene, refused = _compile(source, grip)
     chosen = motion_for(scene, motion)
     name = str(motion) if motion is not None else scene.path.with_suffix(".csv").name

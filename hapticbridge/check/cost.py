@@ -16,7 +16,7 @@ from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.observe import not_finite
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.clock import LOWEST_RATE
-from hapticbridge.demand.rehearsal import Setting, rehearsal_parameters
+from hapticbridge.demand.rehearsal import RunPoint, rehearsal_parameters
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import OK
@@ -191,7 +191,7 @@ class Cost:
 def measure_cost(
     scene: Scene,
     samples: NDArray[np.void],
-    setting: Setting,
+    setting: RunPoint,
     *,
     clock: Callable[[], int] = time.perf_counter_ns,
     progress: Callable[[int, int], None] | None = None,
@@ -247,7 +247,7 @@ def measure_cost(
 
 
 def _time_ticks(
-    scene: Scene, samples: NDArray[np.void], setting: Setting, clock: Callable[[], int]
+    scene: Scene, samples: NDArray[np.void], setting: RunPoint, clock: Callable[[], int]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
     """Returns time in s, contacts and constraint rows of every tick."""
     binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, setting))
@@ -276,7 +276,7 @@ def _time_ticks(
 
 
 def _time_stages(
-    scene: Scene, samples: NDArray[np.void], setting: Setting
+    scene: Scene, samples: NDArray[np.void], setting: RunPoint
 ) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.int64]]:
     """Returns the time in s of every stage of every step by MuJoCo's timers, and the contacts."""
     binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, setting))
@@ -397,7 +397,7 @@ def processor_costs(
     Raises:
         SceneError: A version does not compile, or a result is not finite.
     """
-    stages = [Stage(draft, motion) for draft in (first, second)]
+    stages = [VariantRun(draft, motion) for draft in (first, second)]
     passes: list[NDArray[np.float64]] = []
     start = time.thread_time()
     while len(passes) <= REPEATS:
@@ -409,7 +409,7 @@ def processor_costs(
     return float(seconds[0] / motion.duration), float(seconds[1] / motion.duration)
 
 
-class Stage:
+class VariantRun:
     """A version of a scene that runs through a motion in stretches.
 
     Attributes:
@@ -445,7 +445,7 @@ class Stage:
         return seconds
 
 
-def one_pass(stages: list[Stage]) -> NDArray[np.float64]:
+def one_pass(stages: list[VariantRun]) -> NDArray[np.float64]:
     """Runs all versions through the whole motion in turns; returns s by version and stretch."""
     for stage in stages:
         stage.reset()

@@ -30,7 +30,7 @@ without unit. A grip on the tool itself is at most at 1."""
 _AT_ONCE = 1000  # triangles per block; about 100 MB with a hull of 10 000 facets
 
 
-_SMALLEST_EXTENT = 1e-3  # m; a grip nearer than this counts as on the tool
+_MIN_EXTENT = 1e-3  # m; a grip nearer than this counts as on the tool
 
 
 def mesh_faults(case: SceneUnderCheck) -> Iterator[Fault]:
@@ -101,7 +101,7 @@ def grip_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     centre = mass @ scene.data.xipos[tool_bodies] / mass.sum()
     grip = scene.data.site_xpos[site]
     distance = float(np.linalg.norm(grip - centre))
-    extent = max(float(np.linalg.norm(tool_extent(case))), _SMALLEST_EXTENT)
+    extent = max(float(np.linalg.norm(tool_extent(case))), _MIN_EXTENT)
     if distance <= FARTHEST_GRIP * extent:
         return
     rotation = scene.data.xmat[body].reshape(3, 3)

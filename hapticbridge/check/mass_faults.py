@@ -18,12 +18,12 @@ WATER = 1000.0
 """Default density of a MuJoCo geom in kg/m³."""
 
 
-LARGEST_RATIO = 1000.0
+MAX_RATIO = 1000.0
 """Largest ratio of two masses in contact, or of a load to its carrier, without unit. A contact has
 the stiffness of the lighter body, so the heavier one penetrates a thousand times as deep."""
 
 
-LARGEST_SAG = 1e-3
+MAX_SAG = 1e-3
 """Largest stretch in m of the coupling under the tool's weight at rest."""
 
 
@@ -108,11 +108,11 @@ def _contact_ratios(case: SceneUnderCheck) -> Iterator[Fault]:
         bodies = [int(model.geom_bodyid[geom]) for geom in pair]
         inverse = [1.0 / body_inertia(model, case.scene.data, body) for body in bodies]
         key = frozenset(bodies)
-        if min(inverse) <= 0 or max(inverse) <= LARGEST_RATIO * min(inverse) or key in reported:
+        if min(inverse) <= 0 or max(inverse) <= MAX_RATIO * min(inverse) or key in reported:
             continue
         reported.add(key)
         light, heavy = (case.places.body(bodies[inverse.index(f(inverse))]) for f in (max, min))
-        least = 1.0 / (LARGEST_RATIO * min(inverse))
+        least = 1.0 / (MAX_RATIO * min(inverse))
         yield Fault(
             "mass ratio",
             light,
@@ -134,14 +134,14 @@ def _load_ratios(case: SceneUnderCheck) -> Iterator[Fault]:
         if np.any(model.dof_armature[dofs] > 0):
             continue
         load = float(model.body_subtreemass[body])
-        if load > LARGEST_RATIO * own:
+        if load > MAX_RATIO * own:
             place, name = case.places.body(parent), case.places.body(body).element
             yield Fault(
                 "mass ratio",
                 place,
                 f"{place.element} ({weight(own)}) carries {name} ({weight(load)}), "
                 f"1 to {number(load / own)}: its motion is computed from small differences",
-                f'mass="{load / LARGEST_RATIO:.3g}" or more in it',
+                f'mass="{load / MAX_RATIO:.3g}" or more in it',
             )
 
 
@@ -172,7 +172,7 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     pulls = (data.qfrc_gravcomp - bias)[dofs]
     moved = np.linalg.lstsq(stiffness, pulls, rcond=1e-9)[0]
     sag = float(np.linalg.norm(tool_jacobian[:3] @ moved))
-    if sag <= LARGEST_SAG:
+    if sag <= MAX_SAG:
         return
     of_tool = np.flatnonzero(case.tool_bodies)
     mass = float(model.body_mass[of_tool].sum())

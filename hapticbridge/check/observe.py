@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.demand.methods import RIGID
-from hapticbridge.demand.rehearsal import Setting, rehearsal_parameters
+from hapticbridge.demand.rehearsal import RunPoint, rehearsal_parameters
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import OK, WARNINGS, warning_words
 from hapticbridge.kernel.jit import direct
@@ -158,7 +158,7 @@ def _trees_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
     }
 
 
-# Rehearsal of a scene under a motion
+# RunPoint of a scene under a motion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,7 +183,7 @@ class Playback:
     seconds: float
 
 
-def rehearse(scene: Scene, samples: NDArray[np.void], setting: Setting) -> Playback:
+def rehearse(scene: Scene, samples: NDArray[np.void], setting: RunPoint) -> Playback:
     """Runs the scene from its start as the bridge would, one tick per sample.
 
     The hand does not yield: the handle follows the motion at any force. Two versions of a scene can
@@ -309,7 +309,7 @@ class Observation:
 def observe(
     scene: Scene,
     samples: NDArray[np.void],
-    setting: Setting,
+    setting: RunPoint,
     progress: Callable[[int, int], None] | None = None,
 ) -> Observation:
     """Leads a scene through a motion, as ``rehearse`` does, and inspects every step.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.check.case import samples_of
 from hapticbridge.check.observe import WITHOUT_DISTANCE, Playback, may_be_near, not_finite, rehearse
-from hapticbridge.demand.rehearsal import Setting, rehearsal_parameters
+from hapticbridge.demand.rehearsal import RunPoint, rehearsal_parameters
 from hapticbridge.device import Motion
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel
@@ -33,7 +33,7 @@ class SceneVariant:
 
     source: SceneSource
     grip: str
-    setting: Setting
+    setting: RunPoint
 
     @property
     def spec(self) -> mujoco.MjSpec:

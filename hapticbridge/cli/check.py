@@ -17,7 +17,7 @@ from rich.table import Table
 from hapticbridge.arguments import option, shared
 from hapticbridge.check.case import (
     DEFAULT_PERIOD,
-    LARGEST_WORKSPACE,
+    MAX_WORKSPACE,
     IntendedUse,
     SceneUnderCheck,
     open_case,
@@ -328,7 +328,7 @@ class Check:
     """Contacts of the run that the scene is checked for. 'rigid', the default of 'run': settings of
     contacts, limits and equality constraints do not matter. 'scene': those of the MJCF."""
     scale: float = shared(Workspace, "scale")
-    workspace: float = option(LARGEST_WORKSPACE, unit="m", least=0.0, is_open=True)
+    workspace: float = option(MAX_WORKSPACE, unit="m", least=0.0, is_open=True)
     """Edge in m of the cube that your device reaches; by default that of the largest table-top
     devices."""
     plot: Path | None = None

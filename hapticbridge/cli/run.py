@@ -27,7 +27,7 @@ from hapticbridge.demand.certificate import (
 from hapticbridge.demand.guard import refuse_simulated_time
 from hapticbridge.demand.loop_setting import device_period
 from hapticbridge.demand.methods import RunCoupling, default_method, unsuited_reason
-from hapticbridge.demand.rehearsal import Setting
+from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.base import checked_close
 from hapticbridge.device.mouse import MouseDevice
@@ -508,7 +508,7 @@ class Run:
             return 1
         ticks = self._scene_ticks(scene)
         period = max(ticks, 1) * period_of(self.options.loop_rate)
-        setting = Setting(NO_HAND, period, contact=self.options.contact or "rigid")
+        setting = RunPoint(NO_HAND, period, contact=self.options.contact or "rigid")
         count, moved = own_substeps(source, scene, setting)
         if ticks:  # more steps would not be in time
             count = 1

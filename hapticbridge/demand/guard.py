@@ -25,7 +25,7 @@ from hapticbridge.kernel.tick_guard import FARTHEST
 
 # Limits of the wrench and of the run
 
-LONGEST_RAMP = 60.0
+MAX_RAMP = 60.0
 """Longest ramp in s. A larger number is taken for a mistake in the unit."""
 
 USUAL_RAMP = 0.5
@@ -89,7 +89,7 @@ class Limits:
     torque: float = _limit(math.inf, "N m", flag="torque-limit")
     hold_force: float = _limit(USUAL_HOLD_FORCE, "N")
     hold_torque: float = _limit(USUAL_HOLD_TORQUE, "N m")
-    ramp: float | None = option(None, unit="s", least=0.0, most=LONGEST_RAMP)
+    ramp: float | None = option(None, unit="s", least=0.0, most=MAX_RAMP)
     stretch: float = _limit(USUAL_STRETCH, "m", flag="stretch-limit")
     angle: float = _limit(USUAL_ANGLE, "rad", flag="angle-limit")
     energy: float = _limit(USUAL_ENERGY, "J", flag="energy-limit")

@@ -596,7 +596,7 @@ def prepare_hands(
         scene.of_hand(hand).set_gains(*method.gains(law, period))
 
 
-LARGEST_WRENCH = 1e30
+MAX_WRENCH = 1e30
 """Force in N and torque in N m of a device without limits; infinity is no limit of a run."""
 
 
@@ -623,8 +623,8 @@ def unguarded_parameters(
         period=period,
         substeps=substeps,
         coupling=method.law_coupling(coupling, period / substeps),
-        force_limit=LARGEST_WRENCH,
-        torque_limit=LARGEST_WRENCH,
+        force_limit=MAX_WRENCH,
+        torque_limit=MAX_WRENCH,
         ramp_ticks=0,
         device_origin=IDENTITY_POSE,
         handle_origin=scene.grip_pose(),

@@ -15,7 +15,7 @@ from hapticbridge.scene import Scene
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class RunPoint:
     """Coupling and rate at which a scene is run.
 
     Attributes:
@@ -38,7 +38,7 @@ class Setting:
         return required_damping(used, self.period, method.law_evaluations(self.substeps))
 
 
-def rehearsal_parameters(scene: Scene, setting: Setting) -> RunParameters:
+def rehearsal_parameters(scene: Scene, setting: RunPoint) -> RunParameters:
     """Resets a scene for the default method, and returns the parameters.
 
     Raises:

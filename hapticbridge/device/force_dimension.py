@@ -56,7 +56,7 @@ from hapticbridge.device.driver import (
 )
 from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.device.transport.maker_library import LibraryFiles, MakerLibrary
-from hapticbridge.device.watchdog import SHORTEST_WATCHDOG, SILENCE, SilenceDetector, watchdog_time
+from hapticbridge.device.watchdog import MIN_WATCHDOG, SILENCE, SilenceDetector, watchdog_time
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
@@ -543,7 +543,7 @@ DRIVER = Driver(
     axes="x, y, z; with rx, ry, rz where the wrist has motors, and a grip axis where a gripper has",
     force="the library's limit, else 12 N (omega, sigma, lambda) or 20 N (delta)",
     rate="4 kHz, as stated by the maker",
-    on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms; a device without "
+    on_stall=f"its watchdog ends the force after {1e3 * MIN_WATCHDOG:g} ms; a device without "
     "one is reported at its start",
     options={
         "library": str,

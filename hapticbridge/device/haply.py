@@ -346,7 +346,7 @@ FORCE_LIMIT = 2.0
 FIRST_ANSWER = 1.0
 """Longest wait in s for the list of devices and for the first state."""
 
-LONGEST_PERIOD = 0.02
+MAX_PERIOD = 0.02
 """Longest period of the loop in s. A force lasts only for its message; at a longer period the
 device would idle between two ticks."""
 
@@ -424,13 +424,13 @@ class HaplyDevice:
         """Requests the state, without force.
 
         Raises:
-            DeviceError: The period exceeds ``LONGEST_PERIOD``, or the service reports no position.
+            DeviceError: The period exceeds ``MAX_PERIOD``, or the service reports no position.
             DeviceLost: The service is gone or silent.
         """
-        if checked_period(period) > LONGEST_PERIOD:
+        if checked_period(period) > MAX_PERIOD:
             raise DeviceError(
                 f"{self._name}: a force holds only for its message, so the rate must be at least "
-                f"{1 / LONGEST_PERIOD:g} Hz, not {1 / period:g} Hz"
+                f"{1 / MAX_PERIOD:g} Hz, not {1 / period:g} Hz"
             )
         self._take()
         self._pending, self.held_back = None, 0

@@ -44,7 +44,7 @@ ORIENTATION = ("qw", "qx", "qy", "qz")
 NORM_TOLERANCE = 1e-3
 """Largest deviation of a quaternion's norm from 1, without unit. It admits four printed digits, but
 no mistake."""
-LARGEST_NUMBER = 1e12
+MAX_NUMBER = 1e12
 """Largest magnitude of a time in s or a position in m; sums and differences remain finite."""
 
 
@@ -109,12 +109,12 @@ class Motion:
 def first_fault(table: NDArray[np.float64]) -> tuple[int, str] | None:
     """Returns the first invalid row of a motion and the reason; None if all rows are valid."""
     faults: list[tuple[int, str]] = []
-    is_good = np.abs(table) <= LARGEST_NUMBER
+    is_good = np.abs(table) <= MAX_NUMBER
     if not is_good.all():
         row = int(np.argmin(is_good.all(axis=1)))
         column = int(np.argmin(is_good[row]))
         name, value = (TIME_AND_POSITION + ORIENTATION)[column], float(table[row, column])
-        fault = f"is beyond ±{LARGEST_NUMBER:g}" if np.isfinite(value) else "is not finite"
+        fault = f"is beyond ±{MAX_NUMBER:g}" if np.isfinite(value) else "is not finite"
         faults.append((row, f"{name} = {value:g} {fault}"))
         table = table[:row]
     times = table[:, 0]

@@ -178,7 +178,7 @@ shorter time, stalls of an ordinary kernel would look like a lost device. At a l
 force would stay on the motors for longer."""
 
 
-SHORTEST_WATCHDOG, WATCHDOG_PERIODS = 0.02, 10
+MIN_WATCHDOG, WATCHDOG_PERIODS = 0.02, 10
 """Shortest watchdog of a device in s, and watchdog in periods of the loop; the longer time is
 requested. An ordinary kernel stalls a loop for some ms now and then. A force that drops out each
 time would rattle."""
@@ -223,4 +223,4 @@ class SilenceDetector:
 
 def watchdog_time(period: float) -> float:
     """Returns the time in s for which a device should hold a force, for a loop's period in s."""
-    return max(SHORTEST_WATCHDOG, WATCHDOG_PERIODS * period)
+    return max(MIN_WATCHDOG, WATCHDOG_PERIODS * period)

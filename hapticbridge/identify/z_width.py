@@ -72,7 +72,7 @@ PUSH_SHARE = 0.3
 """Force of the push as a share of the allowed force, without unit. The wall's own force is then
 about as large."""
 
-TRIAL, LONGEST_TRIAL = 1.2, 6.0
+TRIAL, MAX_TRIAL = 1.2, 6.0
 """Shortest and longest trial in s. The shortest one reveals 1 % below the limit for a device of 0.1
 kg and 2 N s/m."""
 
@@ -156,7 +156,7 @@ class WallBench:
             if progress is not None:
                 progress(stiffness)
             swing = trials[-1].swing if trials else 0.0
-            duration = min(max(TRIAL, SWINGS * swing), LONGEST_TRIAL)
+            duration = min(max(TRIAL, SWINGS * swing), MAX_TRIAL)
             trials.append(self.try_wall(stiffness, damping, duration))
             return trials[-1].is_borne
 

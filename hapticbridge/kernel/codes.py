@@ -246,6 +246,6 @@ stays as if a clutch button were held. Both let the hand go."""
 EQUALITY, LIMIT_JOINT, LIMIT_TENDON, CONTACT_PYRAMIDAL = 0, 3, 4, 6
 """Kinds of constraint rows, numbered as in MuJoCo's ``mjtConstraint``."""
 
-LARGEST_CONTROL = 1e10
+MAX_CONTROL = 1e10
 """Largest control in N and N m, MuJoCo's mjMAXVAL. MuJoCo ignores a larger one; a run that reaches
 it has diverged."""

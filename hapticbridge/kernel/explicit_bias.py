@@ -56,7 +56,7 @@ from hapticbridge.kernel.mujoco_c import (
 )
 from hapticbridge.kernel.pose import dot, vector_of
 
-LARGEST_SHARE = 0.99
+MAX_SHARE = 0.99
 """Largest share of a tree's kinetic energy that one tick takes, without unit. The rest waits for
 the next tick. With 0.5, an arm that flails at 1000 rad/s gains more than it loses."""
 
@@ -210,7 +210,7 @@ def _slow_down(s: State, velocity: int, excess: float) -> None:
         weight = kinetic * turning * turning
         if not weight > 0.0:
             continue
-        taken = min(excess * weight / total, LARGEST_SHARE * kinetic)
+        taken = min(excess * weight / total, MAX_SHARE * kinetic)
         loss = 1.0 - math.sqrt(1.0 - taken / kinetic)
         first = firsts[tree]
         for i in range(first, first + ints(mj.tree_dofnum, mj.ntree)[tree]):

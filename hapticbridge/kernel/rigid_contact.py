@@ -81,14 +81,14 @@ MARGIN = 5e-5
 before they touch. It covers the speed that a body gains within a step. A larger one costs time for
 contacts without force."""
 
-LARGEST_MARGIN = 5e-3
+MAX_MARGIN = 5e-3
 """Largest margin in m that a geom's speed adds in steps of up to 1 ms, that of 5 m/s at 1 ms. A
 faster geom may be first seen in penetration, which the tank then pays for."""
 
 
 def largest_margin(time: float) -> float:
     """Returns the largest margin in m for steps, or periods of a scene beside the loop, in s."""
-    return max(LARGEST_MARGIN, 1e3 * LARGEST_MARGIN * time)
+    return max(MAX_MARGIN, 1e3 * MAX_MARGIN * time)
 
 
 RESULTS_AHEAD = 3

@@ -44,7 +44,7 @@ from hapticbridge.kernel.codes import (
     GAVE_ENERGY,
     HALF_DONE,
     HAND_CODES,
-    LARGEST_CONTROL,
+    MAX_CONTROL,
     OK,
     RING_FULL,
     TRIP,
@@ -389,7 +389,7 @@ def is_sound(s: State) -> bool:
     mj, found = s.mj, 0
     for values in (floats(mj.qpos, mj.nq), floats(mj.qvel, mj.nv)):
         for value in values:  # without a branch, so that several are compared at once
-            found |= not abs(value) < LARGEST_CONTROL  # also for a value that is not a number
+            found |= not abs(value) < MAX_CONTROL  # also for a value that is not a number
     return found == 0
 
 
@@ -444,7 +444,7 @@ def _failure(s: State, square: float) -> int:
     is_shown = s.run.scheme == Scheme.SHOWN
     code = s.shown.failure if is_shown else warning_at(s.mj.warnings)
     # MuJoCo ignores a control beyond its limit, so a wrench to be applied must stay below
-    is_too_large = square > LARGEST_CONTROL * LARGEST_CONTROL
+    is_too_large = square > MAX_CONTROL * MAX_CONTROL
     if code == OK and (not math.isfinite(square) or (s.run.holds_wrench and is_too_large)):
         return BAD_RESULT
     return int(code)

@@ -19,7 +19,7 @@ from hapticbridge.arguments import Arguments
 from hapticbridge.clock import RealClock, period_of
 from hapticbridge.confinement import means
 from hapticbridge.device.discovery import blind_spots, plugged_devices
-from hapticbridge.device.watchdog import SHORTEST_WATCHDOG
+from hapticbridge.device.watchdog import MIN_WATCHDOG
 from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.realtime import (
     Grant,
@@ -35,7 +35,7 @@ from hapticbridge.realtime.realtime import CAPABILITIES, LASTING, SHELL
 # Baseline of a C program, ``cyclictest``
 
 INSTALL = "sudo apt install rt-tests"
-_LONGEST_US = 50_000
+_MAX_US = 50_000
 """Width of the histogram in µs; later wake-ups count as the maximum."""
 
 _TRIAL_NS = 1_000_000
@@ -85,7 +85,7 @@ def run(
     """
     period_us = max(round(period_ns * 1e-3), 1)
     command = ["cyclictest", "--quiet", f"--priority={priority}", f"--interval={period_us}"]
-    command += [f"--loops={ticks}", f"--histogram={_LONGEST_US}"]
+    command += [f"--loops={ticks}", f"--histogram={_MAX_US}"]
     command += ["--mlockall"] if locks_memory else []
     command += [] if core is None else [f"--affinity={core}"]
     try:
@@ -538,7 +538,7 @@ def judged(
 
 def _stall_words(bridge: Lateness) -> str:
     """Describes the effect of a long stall on the hand; empty if all were short."""
-    if bridge.worst <= SHORTEST_WATCHDOG:
+    if bridge.worst <= MIN_WATCHDOG:
         return ""
     return (
         f"; it stalled for {1e3 * bridge.worst:.0f} ms: meanwhile a device keeps applying its "

@@ -69,7 +69,7 @@ STANDSTILL = 2.0
 """Longest wait in s for a recorder that takes no record and answers nothing. Force is zero and the
 device closed by then. A shorter wait would give up a slow disk's recorder."""
 
-LONGEST_CLOSE = 30.0
+MAX_CLOSE = 30.0
 """Longest wait in s for a recorder that still takes records: a full ring on a slow disk."""
 
 _LOOK = 0.01
@@ -280,8 +280,8 @@ class Recorder:
                 before, heard = state, now
             if now > heard + STANDSTILL:
                 return {"left": f"stood still for {STANDSTILL:g} s"}
-            if now > began + LONGEST_CLOSE:
-                return {"left": f"worked for {LONGEST_CLOSE:g} s"}
+            if now > began + MAX_CLOSE:
+                return {"left": f"worked for {MAX_CLOSE:g} s"}
 
     def _leave(self, reason: str) -> None:
         """Leaves a process that stands still to finish its file, or ends one without a file.

@@ -24,7 +24,7 @@ PLACE = 1e-4
 """Largest distance in m between the tool, simulated again, and its record. It is less than a pixel.
 Beyond it the picture would show another run, and is refused."""
 
-LONGEST_ARROW = 0.8
+MAX_ARROW = 0.8
 """Length of the arrow of the largest force, as a share of the scene's extent. A longer one leaves
 the picture."""
 
@@ -257,7 +257,7 @@ class Stage:
         strongest = np.linalg.norm(contacts[:, 1], axis=1).max(initial=self.tool_reference)
         for place, force in contacts:
             _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, _CONTACT, position=place, size=size)
-            tip = place + force * (LONGEST_ARROW * extent / strongest)
+            tip = place + force * (MAX_ARROW * extent / strongest)
             _add(scene, mujoco.mjtGeom.mjGEOM_ARROW, _CONTACT, between=(place, tip), size=size)
 
     def add_coupling(self, scene: mujoco.MjvScene) -> None:
@@ -279,7 +279,7 @@ class Stage:
             capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
             _add(scene, capsule, colour, between=(tool, handle), size=0.3 * size)
         if force.any():
-            tip = handle + force * (LONGEST_ARROW * self.model.stat.extent / self.hand_reference)
+            tip = handle + force * (MAX_ARROW * self.model.stat.extent / self.hand_reference)
             arrow = mujoco.mjtGeom.mjGEOM_ARROW
             _add(scene, arrow, _HAND, between=(handle, tip), size=0.5 * size)
 

@@ -45,7 +45,7 @@ from hapticbridge.units import format_si
 
 # Commands and their wire format
 
-LONGEST_LINE = 250
+MAX_LINE = 250
 """Largest size of a line in bytes; the longest command has about 170."""
 
 
@@ -161,8 +161,8 @@ def command_of(line: bytes) -> Command:
         CommandError: The line is too long, not a command, or has values that the command does not
             take.
     """
-    if len(line) > LONGEST_LINE:
-        raise CommandError(f"a command has at most {LONGEST_LINE} bytes")
+    if len(line) > MAX_LINE:
+        raise CommandError(f"a command has at most {MAX_LINE} bytes")
     try:
         values: Any = read_json(line)
         name = values.pop("command")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import RIGID
-from hapticbridge.demand.rehearsal import Setting, rehearsal_parameters
+from hapticbridge.demand.rehearsal import RunPoint, rehearsal_parameters
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.mujoco_c import quiet
@@ -100,7 +100,7 @@ class OwnMotion:
             "active; --contact rigid takes it back, and more --substeps create less"
         )
 
-    def remedy(self, setting: Setting) -> str:
+    def remedy(self, setting: RunPoint) -> str:
         """Returns advice for a run with a setting."""
         period = setting.period
         if self.step > (1.0 + ROUNDING) * period:
@@ -112,7 +112,7 @@ class OwnMotion:
         return "a shorter time step (--rate or --substeps) brings the two closer"
 
 
-def own_motion(source: SceneSource, scene: Scene, setting: Setting) -> OwnMotion | None:
+def own_motion(source: SceneSource, scene: Scene, setting: RunPoint) -> OwnMotion | None:
     """Compares the first half second without a hand with that of the file's own options.
 
         JND = ‖p − q‖ / max(1 mm, 0.07 ‖p − p_0‖)
@@ -168,7 +168,7 @@ class _FileMotion:
         _place_bodies(data)
         return cls(data, start, data.xipos.copy(), min(count * step, SECONDS))
 
-    def against(self, scene: Scene, setting: Setting) -> OwnMotion:
+    def against(self, scene: Scene, setting: RunPoint) -> OwnMotion:
         """Compares with the motion in the bridge."""
         data, step = self.data, float(self.data.model.opt.timestep)
         setting = replace(setting, coupling=NO_HAND)
@@ -201,7 +201,7 @@ def _place_bodies(data: mujoco.MjData) -> None:
     mujoco.mj_comPos(data.model, data)
 
 
-def _energy_of_motion_alone(scene: Scene, setting: Setting, seconds: float) -> float:
+def _energy_of_motion_alone(scene: Scene, setting: RunPoint, seconds: float) -> float:
     """Moves a scene by its ticks in the bridge.
 
     Returns:
@@ -227,7 +227,7 @@ def _energy_of_motion_alone(scene: Scene, setting: Setting, seconds: float) -> f
 
 
 def own_substeps(
-    source: SceneSource, scene: Scene, setting: Setting
+    source: SceneSource, scene: Scene, setting: RunPoint
 ) -> tuple[int, OwnMotion | None]:
     """Returns the substeps that keep the file's own time step, and the motion with them.
 

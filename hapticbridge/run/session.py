@@ -65,7 +65,7 @@ from hapticbridge.run.description import (
 from hapticbridge.run.hands import DeviceGroup
 from hapticbridge.run.options import RunSetup
 from hapticbridge.run.request import RunRequest
-from hapticbridge.run.slow_scene import LONGEST_WAIT, SlowScene
+from hapticbridge.run.slow_scene import MAX_WAIT, SlowScene
 from hapticbridge.run.summary import RunOutcome, Summary, hand_energy
 from hapticbridge.scene.checks import first_pump, strongest_actuator
 from hapticbridge.scene.inputs import Write
@@ -549,7 +549,7 @@ class Session:
         if is_missing and lever == 0.0 and not self._has_warned:
             self._has_warned = True
             warnings.warn(
-                f"a step of scene '{self.setup.scene.name}' takes more than {LONGEST_WAIT:g} s: "
+                f"a step of scene '{self.setup.scene.name}' takes more than {MAX_WAIT:g} s: "
                 "the force is off until it ends; 'hapticbridge check' finds what is slow",
                 stacklevel=2,
             )

@@ -37,7 +37,7 @@ from hapticbridge.kernel.tick import (
     take_result,
 )
 
-LONGEST_WAIT = 2.0
+MAX_WAIT = 2.0
 """Time in s that the end of a run waits for a step of the scene, and after which a result that is
 due counts as missing. A shorter one lets the force go in scenes that are merely slow."""
 
@@ -92,7 +92,7 @@ class SlowScene:
         trips, as it would have with its result.
 
         Raises:
-            HapticBridgeError: The step takes longer than ``LONGEST_WAIT``.
+            HapticBridgeError: The step takes longer than ``MAX_WAIT``.
         """
         if self._waits[0]:
             self._finish_step()
@@ -106,11 +106,8 @@ class SlowScene:
 
     @property
     def is_missing(self) -> bool:
-        """True if a result is overdue by more than ``LONGEST_WAIT``."""
-        return (
-            not self.is_idle
-            and self._age[0] * self._loop_period > self._scene_period + LONGEST_WAIT
-        )
+        """True if a result is overdue by more than ``MAX_WAIT``."""
+        return not self.is_idle and self._age[0] * self._loop_period > self._scene_period + MAX_WAIT
 
     @property
     def is_running(self) -> bool:
@@ -163,14 +160,14 @@ class SlowScene:
     def _finish_step(self) -> None:
         if self._thread is None:
             self._code = self._do_step()
-        elif not self._done.wait(LONGEST_WAIT):
-            raise HapticBridgeError(f"a step of the scene takes more than {LONGEST_WAIT:g} s")
+        elif not self._done.wait(MAX_WAIT):
+            raise HapticBridgeError(f"a step of the scene takes more than {MAX_WAIT:g} s")
         if self._error is not None:
             raise self._error
 
     def _work(self) -> None:
         while not self._is_closed:
-            if not self._wake.acquire(timeout=LONGEST_WAIT):
+            if not self._wake.acquire(timeout=MAX_WAIT):
                 continue
             if self._is_closed:
                 return
@@ -193,7 +190,7 @@ class SlowScene:
         return OK
 
     def close(self) -> None:
-        """Ends the thread after its present step, which is waited for ``LONGEST_WAIT`` s.
+        """Ends the thread after its present step, which is waited for ``MAX_WAIT`` s.
 
         A longer step goes on and ``is_running``; model and data then stay as they are, because it
         works on them.
@@ -201,7 +198,7 @@ class SlowScene:
         self._is_closed = True
         self._wake.release()
         if self._thread is not None:
-            self._thread.join(LONGEST_WAIT)
+            self._thread.join(MAX_WAIT)
         if not self.is_running:
             self.bound.release()
 

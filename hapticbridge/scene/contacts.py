@@ -62,7 +62,7 @@ contacts require τ in proportion: at κ = 2.3 the map's τ = 30 h created energ
 STIFFEST = 4.0
 """Largest κ that the rule covers; the map's rows at 2.3 agree with the rule."""
 
-LARGEST_IMPEDANCE = 0.91
+MAX_IMPEDANCE = 0.91
 """Largest d for which the slack conditions hold, without unit: 0.9 as shipped, for any increase
 within 1 mm. At 0.95 throughout, tools of 0.1 kg used 1.07 of the slack at κ = 1.2 and τ = 15 h. At
 0.99 they used 1.4 at κ = 1.5 and τ = 32 h. The strict condition still held there (timeconst 4 h,
@@ -124,7 +124,7 @@ class ContactNumbers:
     @property
     def is_too_stiff(self) -> bool:
         """True if κ or d exceeds the range that stayed within the slack, at any τ."""
-        return max(self.stiffness / STIFFEST, self.impedance / LARGEST_IMPEDANCE) > 1 + ROUNDING
+        return max(self.stiffness / STIFFEST, self.impedance / MAX_IMPEDANCE) > 1 + ROUNDING
 
     @property
     def softness(self) -> float:
@@ -349,8 +349,8 @@ def contact_concerns(
 def _excess(numbers: ContactNumbers) -> str:
     """Names the numbers of a setting that is too stiff which exceed the rule's."""
     found = []
-    if numbers.impedance > LARGEST_IMPEDANCE * (1 + ROUNDING):
-        found.append(f"a larger impedance ({numbers.impedance:.3g}, at most {LARGEST_IMPEDANCE:g})")
+    if numbers.impedance > MAX_IMPEDANCE * (1 + ROUNDING):
+        found.append(f"a larger impedance ({numbers.impedance:.3g}, at most {MAX_IMPEDANCE:g})")
     if numbers.stiffness > STIFFEST * (1 + ROUNDING):
         found.append(
             f"a larger stiffness ({numbers.stiffness:.3g} inertia/step², at most {STIFFEST:g})"

@@ -122,7 +122,7 @@ UNITS = "units"
 """Kind of the fault of a tool whose sizes or masses no hand could hold."""
 
 
-LARGEST_TOOL, HEAVIEST_TOOL = 3.0, 50.0
+MAX_TOOL, HEAVIEST_TOOL = 3.0, 50.0
 """Length in m and mass in kg above which no hand holds a tool, so that wrong units are
 suspected."""
 
@@ -143,7 +143,7 @@ def unit_faults(case: CompiledScene) -> Iterator[Fault]:
     tool_bodies = case.tool_bodies
     mass, extent = float(model.body_mass[tool_bodies].sum()), float(tool_extent(case).max())
     found = []
-    if extent > LARGEST_TOOL:
+    if extent > MAX_TOOL:
         found.append(f"is {length(extent)} long")
     if mass > HEAVIEST_TOOL:
         found.append(f"weighs {weight(mass)}")

@@ -144,7 +144,7 @@ def load_scene(
             ``grips``, else the site ``grip``.
         as_is: If true, a scene is refused that must be changed to be felt (options that exclude the
             coupling, force limits of joints, a tool inside something); else it is changed, and
-            ``Scene.changes`` lists the changes. A small memory (``LEAST_MEMORY``) is enlarged
+            ``Scene.changes`` lists the changes. A small memory (``MIN_MEMORY``) is enlarged
             either way, because that alters no motion.
         **parameters: Values of the scene's parameters, such as ``clearance=0.1e-3``.
             ``scene.scene_parameters`` and ``hapticbridge scenes NAME`` list them. A specification
@@ -236,7 +236,7 @@ def plain_model(source: SceneSource) -> mujoco.MjModel:
         return compiled(source.spec.copy(), source.sources)
 
 
-LEAST_MEMORY = 13 << 20
+MIN_MEMORY = 13 << 20
 """Memory in bytes that MuJoCo gives the smallest scene by default, for contacts and constraints. A
 scene with less in its file gets the default, because a full memory drops contacts."""
 
@@ -278,7 +278,7 @@ def compile_scene(
     changes = set_options(spec, as_is=as_is)
     with _refused(path):
         model = compiled(spec, source.sources)
-        if model.narena < LEAST_MEMORY:
+        if model.narena < MIN_MEMORY:
             before, spec.memory, spec.nstack, spec.njmax = model.narena, -1, -1, -1
             model = compiled(spec, source.sources)
             sizes = (format_si(size, "B") for size in (before, model.narena))

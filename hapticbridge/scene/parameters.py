@@ -36,7 +36,7 @@ TAKEN = ("path_or_name", "grip", "as_is")
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class Effect:
     """One number of the MJCF that depends on a parameter: offset + factor · value.
 
     Attributes:
@@ -76,7 +76,7 @@ class Parameter:
     minimum: float
     maximum: float
     about: str
-    sets: tuple[Setting, ...]
+    sets: tuple[Effect, ...]
 
     @property
     def range(self) -> str:
@@ -170,7 +170,7 @@ def _parameter(name: str, table: object, file: Path) -> Parameter:
     )
 
 
-def _setting(entry: object, where: str) -> Setting:
+def _setting(entry: object, where: str) -> Effect:
     if not isinstance(entry, dict) or not {"kind", "name", "field"} <= set(entry) <= _SET_KEYS:
         raise SceneError(
             f"an entry of 'sets' of {where} is {entry!r:.80}; it must be a table with kind, name "
@@ -187,7 +187,7 @@ def _setting(entry: object, where: str) -> Setting:
             f"an entry of 'sets' of {where} is {entry!r:.120}; kind must be one of "
             f"{choices(KINDS)}, index a whole number >= 0, offset and factor finite"
         )
-    return Setting(entry["kind"], entry["name"], entry["field"], index, *map(float, numbers))
+    return Effect(entry["kind"], entry["name"], entry["field"], index, *map(float, numbers))
 
 
 _AGREEMENT, _ROUNDING = 1e-9, 1e-12
@@ -268,7 +268,7 @@ def _check_value(scene: str, name: str, value: float, known: Mapping[str, Parame
         )
 
 
-def _elements(spec: mujoco.MjSpec, setting: Setting, parameter: str) -> list[Any]:
+def _elements(spec: mujoco.MjSpec, setting: Effect, parameter: str) -> list[Any]:
     named = [element for element in getattr(spec, KINDS[setting.kind]) if element.name]
     found = [element for element in named if fnmatchcase(element.name, setting.name)]
     if not found:
@@ -284,11 +284,11 @@ class _Place:
     """One number of the MJCF and its terms: the sum of offset + factor · value."""
 
     element: Any
-    setting: Setting
-    terms: dict[str, Setting] = field(default_factory=dict)
+    setting: Effect
+    terms: dict[str, Effect] = field(default_factory=dict)
     default: float = 0.0
 
-    def add(self, parameter: Parameter, setting: Setting) -> None:
+    def add(self, parameter: Parameter, setting: Effect) -> None:
         """Adds the term of a parameter."""
         if parameter.name in self.terms:
             raise SceneError(f"parameter '{parameter.name}' sets {self._words} twice; set it once")

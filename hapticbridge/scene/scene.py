@@ -23,7 +23,7 @@ from hapticbridge.kernel.codes import (
 from hapticbridge.kernel.colliders import use_exact_points
 from hapticbridge.kernel.mujoco_c import warning_of
 from hapticbridge.kernel.pose import IDENTITY_POSE
-from hapticbridge.kernel.rigid_contact import IMPRATIO, LARGEST_MARGIN, MARGIN, largest_margin
+from hapticbridge.kernel.rigid_contact import IMPRATIO, MARGIN, MAX_MARGIN, largest_margin
 from hapticbridge.scene.compile import SceneChange, clause, compiled, go_to_start
 from hapticbridge.scene.contacts import announce_soft_equalities
 from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
@@ -44,7 +44,7 @@ def _rigid_options(option: mujoco.MjOption) -> dict[str, Any]:
         "impratio": IMPRATIO,
         "noslip_iterations": 0,
         # it stands for all margins where the file overrides them, and cannot follow the speed
-        "o_margin": max(option.o_margin, LARGEST_MARGIN if _overrides(option) else MARGIN),
+        "o_margin": max(option.o_margin, MAX_MARGIN if _overrides(option) else MARGIN),
         **{
             name: (min if "tolerance" in name else max)(getattr(option, name), usual)
             for name, usual in _PRECISE.items()

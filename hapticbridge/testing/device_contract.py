@@ -46,14 +46,14 @@ from hapticbridge.kernel.tick_guard import FARTHEST
 PERIOD, TICKS = 1e-3, 300
 """Period of the loop in s, and number of ticks in each run."""
 
-LONGEST_CALL, SLOW_SHARE = 0.5 * PERIOD, 0.1
+MAX_CALL, SLOW_SHARE = 0.5 * PERIOD, 0.1
 """Longest time in s of a call in the loop, and share of the calls that may exceed it, because the
 machine stalls. A device that waits for its hardware exceeds it in most calls."""
 
 SPEED_TICKS = 20
 """Number of ticks over which a speed is measured, so that a device at 125 Hz has new samples."""
 
-LONGEST_END = 10
+MAX_END = 10
 """Number of ticks after ``close`` in which the force must be zero. They are half of the shortest
 watchdog, so that a watchdog does not count as a zero force."""
 
@@ -157,11 +157,11 @@ def no_call_of_the_loop_waits(bench: _Bench) -> None:
         bench.device.write(np.zeros(6))
         times.append(bench.clock.now())
         for name, before, after in zip(slow, times, times[1:], strict=False):
-            slow[name] += 1e-9 * (after - before) > LONGEST_CALL
+            slow[name] += 1e-9 * (after - before) > MAX_CALL
             _require(
                 slow[name] <= SLOW_SHARE * TICKS,
                 f"{name}() waits: more than {SLOW_SHARE:.0%} of the calls took over "
-                f"{1e3 * LONGEST_CALL:g} ms; take what has arrived, and return",
+                f"{1e3 * MAX_CALL:g} ms; take what has arrived, and return",
             )
 
 
@@ -284,7 +284,7 @@ def _require_motors_off(bench: _Bench, force: Callable[[], Iterable[float]]) -> 
     else:
         raise AssertionError("force= reports no force, although one was written")
     bench.device.close()
-    for _ in range(LONGEST_END):
+    for _ in range(MAX_END):
         bench.clock.wait()
         if not any(force()):
             return

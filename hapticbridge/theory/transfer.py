@@ -279,7 +279,7 @@ class SampledLaw(NamedTuple):
 Termination = Literal["software", "device"]
 """Element that terminates the line at the device."""
 
-LONGEST_TRIP = 1_000_000
+MAX_TRIP = 1_000_000
 """Largest round trip in samples. Beyond it rounding no longer separates nθ/2 from a pole."""
 
 
@@ -325,7 +325,7 @@ def transmission_line_spectrum(
     period = scalar("period", period, "s", positive=True)
     theta = angles(frequency, period)
     one_of("termination", terminated_by, ("software", "device"))
-    trip = whole("round trip", round_trip, least=1, most=LONGEST_TRIP)
+    trip = whole("round trip", round_trip, least=1, most=MAX_TRIP)
     z = checked("impedance", impedance, "N s/m", positive=True)
     z = z.reshape(z.shape + (1,) * theta.ndim)
     if terminated_by == "device":
@@ -356,6 +356,6 @@ def transmission_line_stiffness(
         Brown & Colgate 1997, section 6 (future work).
     """
     period = scalar("period", period, "s", positive=True)
-    trip = whole("round trip", round_trip, least=1, most=LONGEST_TRIP)
+    trip = whole("round trip", round_trip, least=1, most=MAX_TRIP)
     impedance = checked("device damping", device_damping, "N s/m", positive=True)
     return plain(np.asarray(2 * impedance / (trip * period)))

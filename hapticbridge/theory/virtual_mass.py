@@ -34,7 +34,7 @@ Integrator = Literal["implicit", "semi_implicit", "explicit"]
 FORCE_DELAY: dict[str, int] = {"implicit": 0, "semi_implicit": 1, "explicit": 2}
 """Samples from force to position, per integrator."""
 
-LARGEST_PRODUCT = 1e280
+MAX_PRODUCT = 1e280
 """Largest product of two coefficients, in units of K: the range of a double, less a reserve for
 sums of a few products."""
 
@@ -197,7 +197,7 @@ def environment_minimum_damping(
         top, bottom = _polynomials(unit, g, inertia, delay)
         size = np.abs(top).max(axis=-1) * np.abs(bottom).max(axis=-1)
     # products of the coefficients must fit a double, and μ k⁴ must not underflow
-    is_exact = (size < LARGEST_PRODUCT) & (inertia > 1 / LARGEST_PRODUCT)
+    is_exact = (size < MAX_PRODUCT) & (inertia > 1 / MAX_PRODUCT)
     if not (is_exact | ~stable).all():
         raise CouplingError(
             "stiffness, damping/period and mass/period² lie too far apart for double precision"

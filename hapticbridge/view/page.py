@@ -66,7 +66,7 @@ _CONTACT = (77, 208, 225)
 FARTHEST = 0.25
 """Length of the spring at the longest stretch so far, as a share of the scene's extent."""
 
-LONGEST_ARROW = 0.5
+MAX_ARROW = 0.5
 """Length of the arrow of the largest force, as a share of the scene's extent."""
 
 _BLUE, _HAND = (26, 95, 180), (230, 97, 0)
@@ -348,7 +348,7 @@ class Ghost:
         self._spring.colors = np.full((POINTS, 2, 3), colour, dtype=np.uint8)
         self._arrow.visible = strength > 1e-3 * hand_reference
         if self._arrow.visible:
-            reach = LONGEST_ARROW * self._extent / max(hand_reference, strength)
+            reach = MAX_ARROW * self._extent / max(hand_reference, strength)
             points = np.array([[end, end + reach * sight.hand_force]])
             self._arrow.points = points.astype(np.float32)
 
@@ -548,7 +548,7 @@ class Page:
 
     def _show_contacts(self, sight: Sight) -> None:
         self._strongest = max(self._strongest, self.tool_reference, _strongest(sight))
-        reach = LONGEST_ARROW * self._extent / self._strongest
+        reach = MAX_ARROW * self._extent / self._strongest
         touches = bool(len(sight.contact_places))
         self._contacts.visible = self._pushes.visible = touches
         if touches:

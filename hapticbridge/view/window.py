@@ -25,7 +25,7 @@ from hapticbridge.device.mouse import Pose, pose_of_line
 from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.files import install_command
 from hapticbridge.recording import Attachment
-from hapticbridge.run.commands import INTERVAL, LONGEST_LINE, Command, command_of
+from hapticbridge.run.commands import INTERVAL, MAX_LINE, Command, command_of
 from hapticbridge.signals import deferring_stops
 
 HOST = "127.0.0.1"
@@ -249,7 +249,7 @@ class Window:
         stream = cast(IO[bytes], process and process.stdout)
         with contextlib.suppress(OSError, ValueError):
             self._answers.put(json.loads(stream.readline() or b"{}"))
-            while line := stream.readline(LONGEST_LINE + 1):
+            while line := stream.readline(MAX_LINE + 1):
                 if not line.endswith(b"\n"):
                     return  # longer than any command, so not from the process that was started
                 if self.on_hand is not None and (pose := pose_of_line(line)) is not None:

@@ -75,7 +75,7 @@ from hapticbridge.lab.chart.peg import (
     penetrations,
     resting_peg,
 )
-from hapticbridge.lab.chart.scene_run import Stage, path_of
+from hapticbridge.lab.chart.scene_run import Prepared, path_of
 from hapticbridge.lab.chart.setting import SPRING, Setting, chosen_periods
 from hapticbridge.lab.chart.workload import PASSIVE, Take
 from hapticbridge.lab.engines import base
@@ -176,14 +176,16 @@ class Pegs:
             simulation.step(pose.position, pose.quaternion)
         return simulation
 
-    def own_stage(self, first: NDArray[np.float64], index: int, *, is_free: bool = False) -> Stage:
+    def own_stage(
+        self, first: NDArray[np.float64], index: int, *, is_free: bool = False
+    ) -> Prepared:
         """Returns a stage of the bridge whose peg starts at a pose and is led to a push."""
         scene = load_scene("peg_in_hole", friction=0.0)
         scene.model.key_qpos[0] = (*first[:3], *quaternion(first[3:]))
         if is_free:
             scene.model.geom_contype[:] = scene.model.geom_conaffinity[:] = 0
         path = path_of(ramp(first, index).relative())
-        return Stage(scene, path, RAMP + HOLD + TURN * self.period, COUPLING)
+        return Prepared(scene, path, RAMP + HOLD + TURN * self.period, COUPLING)
 
     def settled_place(self, name: str, first: NDArray[np.float64], index: int) -> object:
         """Returns the place in m of a peg that was led to a push; inf for a failure."""

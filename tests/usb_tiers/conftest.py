@@ -81,4 +81,4 @@ def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("hapticbridge.device.falcon.device.SILENCE", 5.0)
         monkeypatch.setattr("hapticbridge.device.watchdog.SILENCE", 5.0)
         monkeypatch.setattr("hapticbridge.demand.guard.PATIENCE", 30.0)
-        monkeypatch.setattr("hapticbridge.device.transport.hid.LONGEST_WRITE", 5.0)
+        monkeypatch.setattr("hapticbridge.device.transport.hid.MAX_WRITE", 5.0)

@@ -42,7 +42,7 @@ from hapticbridge.device.falcon.kinematics import (
     resolution,
 )
 from hapticbridge.device.falcon.protocol import (
-    LONGEST_PERIOD,
+    MAX_PERIOD,
     READ_FROM,
     SIZE,
     WRITE_TO,
@@ -201,10 +201,10 @@ class FalconDevice:
             DeviceError: The period is longer than 0.02 s, the encoders match no position of the
                 grip, or the device is gone.
         """
-        if checked_period(period) > LONGEST_PERIOD:
+        if checked_period(period) > MAX_PERIOD:
             raise DeviceError(
                 f"{self._name}: is polled once per tick, so the rate must be at least "
-                f"{1 / LONGEST_PERIOD:g} Hz, not {1 / period:g} Hz"
+                f"{1 / MAX_PERIOD:g} Hz, not {1 / period:g} Hz"
             )
         motion, reply, sample = self._motion, self._stream.reply, self._last
         self._believe = direct(believe, motion, reply, sample, 0.0)

@@ -53,7 +53,7 @@ shaft of 14.25 mm that drives a sector of 110 mm."""
 ZERO_ANGLE = math.radians(35.0)
 """Thigh angle in rad at which a homed encoder reads 0."""
 
-LARGEST_RADIUS, NEAREST, FARTHEST = 0.075, 0.060, 0.190
+MAX_RADIUS, NEAREST, FARTHEST = 0.075, 0.060, 0.190
 """Limits of a plausible grip position in m: distance from the axis, and smallest and largest
 distance along it. The workspace is 0.1 m wide and reaches from 0.075 to 0.175 m. Positions beyond
 the limits mean a wrong encoder; tighter limits would refuse a grip that leans at its stop."""
@@ -62,7 +62,7 @@ STEPS = 12
 """Largest number of Newton steps. From the middle of the workspace 6 reach its corners, 2 are
 usual."""
 
-LONGEST_STEP = 0.02
+MAX_STEP = 0.02
 """Longest Newton step in m: a fifth of the workspace. A longer first step could leave the region in
 which the legs can lean."""
 
@@ -82,7 +82,7 @@ _COS, _SIN = np.cos(LEG_ANGLES), np.sin(LEG_ANGLES)
 def is_within_reach(position: NDArray[np.float64]) -> bool:
     """Returns whether a grip position in m, shape (3,), is plausible."""
     aside = math.sqrt(position[0] ** 2 + position[1] ** 2)
-    return aside <= LARGEST_RADIUS and NEAREST <= position[2] <= FARTHEST
+    return aside <= MAX_RADIUS and NEAREST <= position[2] <= FARTHEST
 
 
 @compiled
@@ -162,7 +162,7 @@ def forward(angles: NDArray[np.float64], position: NDArray[np.float64]) -> bool:
         if not abs(determinant) >= FLATTEST:
             return False
         length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-        point -= step * min(1.0, LONGEST_STEP / max(length, LONGEST_STEP))
+        point -= step * min(1.0, MAX_STEP / max(length, MAX_STEP))
         if max(abs(gaps[0]), abs(gaps[1]), abs(gaps[2])) < CLOSED:
             for i in range(3):
                 if not levers[i] <= -FLATTEST * THIGH:

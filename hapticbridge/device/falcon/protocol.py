@@ -171,7 +171,7 @@ class ReplyStream:
 READ_FROM, WRITE_TO = 0x81, 0x02
 """Addresses of its bulk endpoints."""
 
-LARGEST_FIRMWARE = 65536
+MAX_FIRMWARE = 65536
 """Largest firmware file in bytes. The four known images have 7324 to 8492 bytes; a larger file is
 not firmware."""
 
@@ -238,14 +238,14 @@ def read_firmware(path: str) -> bytes:
     """
     try:
         with Path(path).open("rb") as file:
-            image = file.read(LARGEST_FIRMWARE + 1)  # a device gives bytes without end
+            image = file.read(MAX_FIRMWARE + 1)  # a device gives bytes without end
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise DeviceError(f"firmware = '{path}': cannot be read ({reason})") from None
-    if not 0 < len(image) <= LARGEST_FIRMWARE:
+    if not 0 < len(image) <= MAX_FIRMWARE:
         raise DeviceError(
             f"firmware = '{path}': has {'no' if not image else 'too many'} bytes; a Falcon's "
-            f"firmware has 1 to {LARGEST_FIRMWARE}"
+            f"firmware has 1 to {MAX_FIRMWARE}"
         )
     return image
 
@@ -367,7 +367,7 @@ def _difference(sent: bytes, echo: bytes, start: int) -> str:
 
 # Start of a Falcon: firmware and homing
 
-LONGEST_PERIOD = 0.02
+MAX_PERIOD = 0.02
 """Longest period of the loop in s. The device is polled once per tick; at a longer period two lost
 replies would already count as silence."""
 

@@ -24,7 +24,7 @@ from hapticbridge.device.rawhid.protocol import (
     DOCUMENT,
     GRIP_PAGE,
     LARGEST,
-    LONGEST_WATCHDOG_MS,
+    MAX_WATCHDOG_MS,
     NAME_PAGE,
     NUMBERS_PAGE,
     VERSION,
@@ -39,7 +39,7 @@ from hapticbridge.device.rawhid.protocol import (
 )
 from hapticbridge.device.transport.hid import HidApi, opened
 from hapticbridge.device.watchdog import (
-    SHORTEST_WATCHDOG,
+    MIN_WATCHDOG,
     ForceOffGuardian,
     SilenceDetector,
     guard_device_node,
@@ -272,7 +272,7 @@ class RawHidDevice:
         self._sample = np.zeros(1 + self._has_grip, SAMPLE_DTYPE)
         self._sample["quaternion"][:, 0] = 1.0
         self._watch = SilenceDetector(now())
-        self._watchdog_ms = LONGEST_WATCHDOG_MS
+        self._watchdog_ms = MAX_WATCHDOG_MS
         self._is_open, self._has_begun = True, False
         self.last_word: ForceOffGuardian | None = None
 
@@ -284,7 +284,7 @@ class RawHidDevice:
                 or reports a fault.
         """
         period = checked_period(period)
-        self._watchdog_ms = min(math.ceil(1e3 * watchdog_time(period)), LONGEST_WATCHDOG_MS)
+        self._watchdog_ms = min(math.ceil(1e3 * watchdog_time(period)), MAX_WATCHDOG_MS)
         self._has_begun = False
         self.states = states = StateStream(self._name)
         self._link.take()
@@ -438,7 +438,7 @@ DRIVER = Driver(
     rate="to 1 kHz, as built",
     options={"serial": str, "log": str, **dict.fromkeys((*CHANGES, *GRIP_CHANGES), float)},
     open=open_rawhid,
-    on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms, if it was built "
+    on_stall=f"its watchdog ends the force after {1e3 * MIN_WATCHDOG:g} ms, if it was built "
     "to the protocol",
     has_guardian=True,
     usage=(0xFFAB, 0x0200),

@@ -23,7 +23,7 @@ FRAME_BYTES = 64
 MAGIC, VERSION = 0x48, 1
 """First two bytes of every frame."""
 
-LONGEST_WATCHDOG_MS = 1000
+MAX_WATCHDOG_MS = 1000
 """Largest watchdog in ms that a device accepts. A hand can still hold against a force for a
 second."""
 

@@ -48,7 +48,7 @@ from hapticbridge.device.rawhid.protocol import (
     force_frame,
 )
 from hapticbridge.device.transport.trace import HexLog
-from hapticbridge.device.watchdog import SHORTEST_WATCHDOG, guard_device_node
+from hapticbridge.device.watchdog import MIN_WATCHDOG, guard_device_node
 from hapticbridge.errors import DeviceError, DeviceLost, choices
 
 # Serial ports of this machine, from pyserial
@@ -57,7 +57,7 @@ BAUDS = (1_000_000, 500_000, 250_000, 115_200, 2_000_000)
 """Baud rates in bit/s that are tried, in this order. At 1 Mbaud a frame takes 0.64 ms. An AVR at
 16 MHz makes the first three exactly. A board with USB of its own ignores the number."""
 
-LONGEST_WRITE = 0.05
+MAX_WRITE = 0.05
 """Longest time in s for a port to accept a frame, which takes 5.6 ms at 115200 baud."""
 
 
@@ -78,7 +78,7 @@ class SerialPort(Protocol):
         """Returns received bytes, without waiting for more."""
 
     def write(self, data: bytes) -> int | None:
-        """Sends bytes; waits for at most ``LONGEST_WRITE``."""
+        """Sends bytes; waits for at most ``MAX_WRITE``."""
 
     def reset_input_buffer(self) -> None:
         """Discards received bytes."""
@@ -129,7 +129,7 @@ class SystemPorts:
             ) from None
         try:
             port: SerialPort = serial.Serial(
-                path, baud, timeout=0, write_timeout=LONGEST_WRITE, exclusive=True
+                path, baud, timeout=0, write_timeout=MAX_WRITE, exclusive=True
             )
         except (OSError, ValueError) as error:
             raise DeviceError(self._reason(path, baud, error)) from None
@@ -235,13 +235,13 @@ class SerialLink:
         """Sends a frame after a byte 0, which is not sent; it replaces an unsent one.
 
         Raises:
-            DeviceLost: The port is gone, or accepted nothing for ``LONGEST_WRITE``.
+            DeviceLost: The port is gone, or accepted nothing for ``MAX_WRITE``.
         """
         self._newest = report[1:]
         self._send()
 
     def close(self) -> None:
-        """Sends the remaining frame, for at most two ``LONGEST_WRITE``, and releases the port."""
+        """Sends the remaining frame, for at most two ``MAX_WRITE``, and releases the port."""
         if not self._is_open:
             return
         try:
@@ -289,7 +289,7 @@ class SerialLink:
         now = self._ports.now()
         try:
             if self._port.out_waiting:
-                if now - self._idle_since > LONGEST_WRITE:
+                if now - self._idle_since > MAX_WRITE:
                     raise TimeoutError
                 return
             self._idle_since, self._newest = now, None
@@ -302,7 +302,7 @@ class SerialLink:
             self._log.add(">", frame)
 
     def _is_drained(self) -> bool:
-        end = self._ports.now() + LONGEST_WRITE
+        end = self._ports.now() + MAX_WRITE
         while self._port.out_waiting:
             if self._ports.now() >= end:
                 return False
@@ -493,7 +493,7 @@ DRIVER = Driver(
         **dict.fromkeys((*CHANGES, *GRIP_CHANGES), float),
     },
     open=open_serial,
-    on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms, if it was built "
+    on_stall=f"its watchdog ends the force after {1e3 * MIN_WATCHDOG:g} ms, if it was built "
     "to the protocol",
     has_guardian=True,
     find=find,

@@ -206,7 +206,7 @@ class HidRequests:
         return report
 
 
-LONGEST_REPORT = 256
+MAX_REPORT = 256
 """Largest report in bytes. Full-speed reports have at most 64; a longer one would be truncated and
 fail its check."""
 
@@ -218,7 +218,7 @@ most that is taken at once, so that a fast device cannot block the loop."""
 FRESH_MS = 2
 """Longest wait in ms for a new report after a full queue. At 1 kHz one comes within 1 ms."""
 
-LONGEST_WRITE = 0.05
+MAX_WRITE = 0.05
 """Longest time in s for a device to accept a report. A full-speed device is polled every
 millisecond, so after 50 polls it never will; Linux gives up only after 5 s."""
 
@@ -316,7 +316,7 @@ class HidLink:
         """Sends a report, its number first; if overlapped, it replaces an unsent one in its slot.
 
         Raises:
-            DeviceLost: The device is gone, or accepted no report for ``LONGEST_WRITE``.
+            DeviceLost: The device is gone, or accepted no report for ``MAX_WRITE``.
         """
         if self._lost or not self._is_open:
             raise DeviceLost(self._lost or f"{self._name} is closed")
@@ -326,7 +326,7 @@ class HidLink:
                     f"{self._name} did not accept a report; unplug it and plug it in again"
                 )
             return
-        if not self._is_idle.is_set() and time.monotonic() - self._busy_since > LONGEST_WRITE:
+        if not self._is_idle.is_set() and time.monotonic() - self._busy_since > MAX_WRITE:
             self._lost = f"{self._name} accepts no reports any more; unplug it and plug it in again"
             raise DeviceLost(self._lost)
         self._outgoing[slot].append(report)
@@ -336,20 +336,20 @@ class HidLink:
         """Sends a report before it returns, and discards unsent ones, for the set-up."""
         for waiting in self._outgoing:
             waiting.clear()
-        if self._lost or not self._is_idle.wait(LONGEST_WRITE) or not self._is_sent(report):
+        if self._lost or not self._is_idle.wait(MAX_WRITE) or not self._is_sent(report):
             raise DeviceLost(
                 self._lost
                 or f"{self._name} did not accept a report; unplug it and plug it in again"
             )
 
     def close(self) -> None:
-        """Sends the remaining reports, for at most ``LONGEST_WRITE``, and releases the device."""
+        """Sends the remaining reports, for at most ``MAX_WRITE``, and releases the device."""
         if not self._is_open:
             return
         self._is_open = False
         if self._writer is not None:
             self._wake.set()
-            self._writer.join(LONGEST_WRITE)
+            self._writer.join(MAX_WRITE)
         if self._writer is None or not self._writer.is_alive():
             self._handle.close()  # not while the writer is inside hidapi, which uses this memory
         self._log.close()
@@ -358,7 +358,7 @@ class HidLink:
         if self._lost or not self._is_open:
             raise DeviceLost(self._lost or f"{self._name} is closed")
         try:
-            report = bytes(self._handle.read(LONGEST_REPORT, timeout_ms))
+            report = bytes(self._handle.read(MAX_REPORT, timeout_ms))
         except (OSError, ValueError):
             self._lost = f"{self._name} is gone: unplugged, or switched off"
             raise DeviceLost(self._lost) from None

@@ -19,10 +19,10 @@ from hapticbridge.errors import DeviceError
 INPUT, OUTPUT, FEATURE = 8, 9, 11
 """Kinds of report, numbered as the main items that describe them."""
 
-LONGEST_DESCRIPTOR = 4096
+MAX_DESCRIPTOR = 4096
 """Largest descriptor in bytes, as in Linux (HID_MAX_DESCRIPTOR_SIZE)."""
 
-LONGEST_REPORT_BITS = 8 * 16384
+MAX_REPORT_BITS = 8 * 16384
 """Largest report in bits, as in Linux (HID_MAX_BUFFER_SIZE)."""
 
 MAX_USAGES = 1024
@@ -112,10 +112,9 @@ def fields_of(descriptor: bytes) -> tuple[Field, ...]:
     Raises:
         DeviceError: The descriptor is not valid; the message names the reason.
     """
-    if not 0 < len(descriptor) <= LONGEST_DESCRIPTOR:
+    if not 0 < len(descriptor) <= MAX_DESCRIPTOR:
         raise DeviceError(
-            f"a report descriptor has {len(descriptor)} bytes; it must have 1 to "
-            f"{LONGEST_DESCRIPTOR}"
+            f"a report descriptor has {len(descriptor)} bytes; it must have 1 to {MAX_DESCRIPTOR}"
         )
     state, fields = _State(), []
     for kind, tag, number in _items(descriptor):
@@ -189,10 +188,10 @@ def _fields(state: _State, kind: int, flags: int) -> list[Field]:
     if report > 255:
         raise DeviceError(f"a report descriptor has the report number {report}; at most 255")
     offset = state.lengths.get((kind, report), 0)
-    if offset + size * count > LONGEST_REPORT_BITS:
+    if offset + size * count > MAX_REPORT_BITS:
         raise DeviceError(
             f"a report descriptor has a report of {offset + size * count} bits; at most "
-            f"{LONGEST_REPORT_BITS}"
+            f"{MAX_REPORT_BITS}"
         )
     state.lengths[kind, report] = offset + size * count
     usages = () if flags & _CONSTANT else tuple(state.full_usages())

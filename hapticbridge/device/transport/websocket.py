@@ -20,7 +20,7 @@ ms."""
 CLOSE_TIMEOUT = 0.2
 """Longest wait in s for the peer's closing frame."""
 
-LARGEST_MESSAGE = 1 << 20
+MAX_MESSAGE = 1 << 20
 """Largest message in bytes. A service with ten devices lists them in some 20 kB."""
 
 MISSING = "the Python package websockets is not installed"
@@ -98,7 +98,7 @@ class WebSocketLink:
                 open_timeout=OPEN_TIMEOUT,
                 close_timeout=CLOSE_TIMEOUT,
                 ping_interval=None,  # the loop itself detects silence, a hundred times sooner
-                max_size=LARGEST_MESSAGE,
+                max_size=MAX_MESSAGE,
                 max_queue=None,
             )
             connection = opening.__enter__()  # required by newer versions; close() is the exit

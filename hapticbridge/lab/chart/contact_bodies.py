@@ -22,7 +22,7 @@ from hapticbridge.kernel.pose import quaternion_exp
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import motion_along
 from hapticbridge.lab.chart.free_bodies import still
-from hapticbridge.lab.chart.scene_run import Stage, Staged, Stages
+from hapticbridge.lab.chart.scene_run import Prepared, Staged, Stages
 from hapticbridge.lab.chart.workload import (
     Panel,
     PeerWork,
@@ -204,7 +204,7 @@ class SlidingBlock(Staged):
         self._reference["wrench_on_tool"][:, 0] = force
         self._place = place
         super().__init__(
-            coupling, Stages(lambda: Stage(block_scene(), pulled, grid * count, coupling))
+            coupling, Stages(lambda: Prepared(block_scene(), pulled, grid * count, coupling))
         )
 
     def peer_work(self) -> PeerWork:
@@ -363,7 +363,8 @@ class RodImpact(Staged):
         self._duration = duration = grid * max(1, round(ROD_DURATION / grid))
         starts = [falls_at(angle) for angle in ANGLES]
         super().__init__(
-            coupling, Stages(lambda: Stage(rod_scene(), still, duration, coupling, starts=starts))
+            coupling,
+            Stages(lambda: Prepared(rod_scene(), still, duration, coupling, starts=starts)),
         )
 
     def peer_work(self) -> PeerWork:
@@ -497,7 +498,7 @@ class Tap(Staged):
         self._reference["wrench_on_tool"][:, 0] = force
         super().__init__(
             coupling,
-            Stages(lambda: Stage(load_scene("virtual_wall"), tapping, grid * count, coupling)),
+            Stages(lambda: Prepared(load_scene("virtual_wall"), tapping, grid * count, coupling)),
         )
 
     def peer_work(self) -> PeerWork:

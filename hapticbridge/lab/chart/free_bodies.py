@@ -17,7 +17,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import work_of
-from hapticbridge.lab.chart.scene_run import Stage, Staged, Stages
+from hapticbridge.lab.chart.scene_run import Prepared, Staged, Stages
 from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
 from hapticbridge.lab.engines.base import Velocity
 from hapticbridge.lab.maps.base import free_body, scene_of
@@ -129,7 +129,9 @@ class DrivenMass(Staged):
         self._duration = grid * self._reference.size
         super().__init__(
             coupling,
-            Stages(lambda: Stage(load_scene("point_mass"), handle_path, self._duration, coupling)),
+            Stages(
+                lambda: Prepared(load_scene("point_mass"), handle_path, self._duration, coupling)
+            ),
         )
 
     def peer_work(self) -> PeerWork:
@@ -239,7 +241,7 @@ class SpinningBody(Staged):
         super().__init__(
             coupling,
             Stages(
-                lambda: Stage(
+                lambda: Prepared(
                     spinning_scene(), still, grid * count, coupling, starts=(set_spinning,)
                 )
             ),
@@ -361,7 +363,8 @@ class SpringArm(Staged):
         self._grid, count = grid, round(ARM_DURATION / grid)
         self._reference = exact_arm(coupling, grid, count)
         super().__init__(
-            coupling, Stages(lambda: Stage(scene_of(_ARM), led_across, grid * count, coupling))
+            coupling,
+            Stages(lambda: Prepared(scene_of(_ARM), led_across, grid * count, coupling)),
         )
 
     def peer_work(self) -> PeerWork:

@@ -21,7 +21,7 @@ from hapticbridge.lab.chart.engine_run import EngineRun, work_of
 from hapticbridge.lab.chart.scene_run import (
     REFERENCE_REFINEMENT,
     OwnReferences,
-    Stage,
+    Prepared,
     Staged,
     Stages,
     path_of,
@@ -287,7 +287,7 @@ class PegInHole(Staged):
         self._reference["wrench_on_tool"] = [each.wrench for each in resting]
         self._finest = finest
         self._duration = grid * round(DURATION / grid)
-        stages = Stages(lambda: Stage(_scene(), peg_path, self._duration, coupling))
+        stages = Stages(lambda: Prepared(_scene(), peg_path, self._duration, coupling))
         self._limits = OwnReferences(stages, grid, finest, MOVING_TIME, refinement)
         super().__init__(coupling, stages, self._limits)
 
@@ -412,7 +412,7 @@ class JammedPeg:
             work = self.work(duration, setting.period, lambda _: {})
             return EngineRun(open_engine(setting.engine), work, setting).takes()[0][0]
         takes: list[Take] = []
-        stage = Stage(self.scene(), path_of(self.motion), duration, self.coupling)
+        stage = Prepared(self.scene(), path_of(self.motion), duration, self.coupling)
         stage.play(setting, lambda take: takes.append(replace(take, records=take.records.copy())))
         return takes[0]
 
@@ -452,7 +452,9 @@ class Jam(Staged):
         self._duration = grid * math.floor(JAM.motion.duration / grid)
         super().__init__(
             JAM.coupling,
-            Stages(lambda: Stage(JAM.scene(), path_of(JAM.motion), self._duration, JAM.coupling)),
+            Stages(
+                lambda: Prepared(JAM.scene(), path_of(JAM.motion), self._duration, JAM.coupling)
+            ),
         )
 
     def peer_work(self) -> PeerWork:

@@ -14,7 +14,7 @@ from hapticbridge.kernel.pose import quaternion_exp
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import work_of
 from hapticbridge.lab.chart.peg import HOLD, RAMP, led, score_at_rest
-from hapticbridge.lab.chart.scene_run import Stage, Staged, Stages
+from hapticbridge.lab.chart.scene_run import Prepared, Staged, Stages
 from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
 from hapticbridge.lab.maps.base import scene_of
 from hapticbridge.run.options import Workspace
@@ -170,9 +170,9 @@ class Stack(Staged):
             coupling, grid * np.arange(1.0, count + 1)
         )
 
-        def stage() -> Stage:
+        def stage() -> Prepared:
             path, duration = leaned_in_scene, grid * count
-            return Stage(
+            return Prepared(
                 stack_scene(), path, duration, coupling, workspace=Workspace(absolute=True)
             )
 
@@ -338,7 +338,7 @@ class HexSocket(Staged):
         self._reference, self._finest = turned_key(coupling), finest
         self._duration = grid * math.ceil(len(TURNS) * (RAMP + HOLD) / grid)
         super().__init__(
-            coupling, Stages(lambda: Stage(hex_scene(), turning, self._duration, coupling))
+            coupling, Stages(lambda: Prepared(hex_scene(), turning, self._duration, coupling))
         )
 
     def peer_work(self) -> PeerWork:

@@ -80,7 +80,7 @@ _BAD = (
 """MuJoCo warnings after which MuJoCo has reset the scene, so that the rest is another run."""
 
 
-class Stage:
+class Prepared:
     """A scene with its motion, prepared anew for every setting; one for all points of a chart.
 
     Args:
@@ -237,7 +237,7 @@ class Stage:
 class SceneRun:
     """A stage at one setting, as a chart times and judges it."""
 
-    def __init__(self, stage: Stage, setting: Setting, judge: Judge) -> None:
+    def __init__(self, stage: Prepared, setting: Setting, judge: Judge) -> None:
         self._stage, self._setting, self._judge = stage, setting, judge
         self.seconds = stage.seconds
 
@@ -264,11 +264,11 @@ class SceneRun:
 class Stages:
     """Stages of a workload. A scene with a weld cannot serve the other methods."""
 
-    def __init__(self, make: Callable[[], Stage]) -> None:
+    def __init__(self, make: Callable[[], Prepared]) -> None:
         self._make = make
-        self._stages: dict[bool, Stage] = {}
+        self._stages: dict[bool, Prepared] = {}
 
-    def for_method(self, setting: Setting) -> Stage:
+    def for_method(self, setting: Setting) -> Prepared:
         """Returns the stage that a setting runs on."""
         is_weld = setting.method.is_weld
         if is_weld not in self._stages:
@@ -368,7 +368,7 @@ class OwnReferences:
 
 
 def fine_records(
-    stage: Stage, setting: Setting, grid: float, count: int
+    stage: Prepared, setting: Setting, grid: float, count: int
 ) -> NDArray[np.void] | None:
     """Runs a stage and keeps one record per ``grid`` s; None if it diverges.
 
@@ -480,14 +480,14 @@ class SceneMotion(Staged):
                 "(t,x,y,z[,qw,qx,qy,qz]) beside it"
             )
         self.name = first.name
-        touched = _first_contact(Stage(first, path_of(motion), motion.duration, coupling))
+        touched = _first_contact(Prepared(first, path_of(motion), motion.duration, coupling))
         self.has_contact = touched is not None
         needed = motion.duration if touched is None else touched + AFTER_CONTACT
         duration = float(np.clip(needed, SHORTEST, LONGEST))
         self.speed = max(1.0, needed / duration)
         duration = grid * max(1, round(duration / grid))
         stages = Stages(
-            lambda: Stage(load_scene(scene), path_of(motion, self.speed), duration, coupling)
+            lambda: Prepared(load_scene(scene), path_of(motion, self.speed), duration, coupling)
         )
         self._limits = OwnReferences(stages, grid, finest, duration, refinement)
         super().__init__(coupling, stages, self._limits)
@@ -585,7 +585,7 @@ def path_of(motion: Motion, speed: float = 1.0) -> Path:
     return path
 
 
-def _first_contact(stage: Stage) -> float | None:
+def _first_contact(stage: Prepared) -> float | None:
     """Returns the time in s of the tool's first touch, None for never.
 
     Contacts at the start do not count: the first tick with more of them does.

@@ -356,7 +356,7 @@ class Contacts(NamedTuple):
         return cls(len(touching), max(touching, default=0.0))
 
 
-class Setting(NamedTuple):
+class Advised(NamedTuple):
     """One setting of an engine: its value, and the page of its documentation that advises it."""
 
     value: str
@@ -413,7 +413,7 @@ class Engine(Protocol):
         """Version of the installed library."""
 
     @property
-    def settings(self) -> Mapping[str, Setting]:
+    def settings(self) -> Mapping[str, Advised]:
         """Settings with the pages of the documentation that advise them."""
 
     def open(self, task: Task, timestep: float) -> Simulation:

@@ -43,13 +43,13 @@ _GUIDE = "PyBullet Quickstart Guide"
 _PARAMETERS = f"{_GUIDE}: setPhysicsEngineParameter"
 _DYNAMICS = f"{_GUIDE}: changeDynamics"
 _SHARED = {
-    "coupling": base.Setting("held force", f"{_GUIDE}: applyExternalForce/Torque"),
-    "body": base.Setting("multibody of one link", f"{_GUIDE}: createMultiBody"),
-    "linearDamping, angularDamping": base.Setting("0 (default 0.04)", _DYNAMICS),
-    "collisionMargin": base.Setting("0 for meshes", _DYNAMICS),
-    "activationState": base.Setting("disable sleeping", _DYNAMICS),
-    "deterministicOverlappingPairs": base.Setting("1", _PARAMETERS),
-    "numSubSteps": base.Setting("0 (default)", _PARAMETERS),
+    "coupling": base.Advised("held force", f"{_GUIDE}: applyExternalForce/Torque"),
+    "body": base.Advised("multibody of one link", f"{_GUIDE}: createMultiBody"),
+    "linearDamping, angularDamping": base.Advised("0 (default 0.04)", _DYNAMICS),
+    "collisionMargin": base.Advised("0 for meshes", _DYNAMICS),
+    "activationState": base.Advised("disable sleeping", _DYNAMICS),
+    "deterministicOverlappingPairs": base.Advised("1", _PARAMETERS),
+    "numSubSteps": base.Advised("0 (default)", _PARAMETERS),
 }
 
 _TYPES = {
@@ -68,11 +68,11 @@ class PybulletEngine:
         """Takes its name, options of ``setPhysicsEngineParameter`` and the solver's name."""
         self.name = name
         self._parameters = dict(parameters)
-        raw = {key: base.Setting(f"{value:g}", _PARAMETERS) for key, value in parameters.items()}
-        self.settings: Mapping[str, base.Setting] = {
+        raw = {key: base.Advised(f"{value:g}", _PARAMETERS) for key, value in parameters.items()}
+        self.settings: Mapping[str, base.Advised] = {
             **_SHARED,
             **raw,
-            "constraintSolverType": base.Setting(solver, _PARAMETERS),
+            "constraintSolverType": base.Advised(solver, _PARAMETERS),
         }
 
     def open(self, task: base.Task, timestep: float) -> PybulletSimulation:

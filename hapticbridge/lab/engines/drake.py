@@ -49,12 +49,12 @@ _PLANT = "Drake, MultibodyPlant"
 _PROPERTIES = "Drake, geometry::DefaultProximityProperties"
 _USER_GUIDE = "Drake, Hydroelastic Contact User Guide"
 _SHARED = {
-    "coupling": base.Setting("held force, applied_generalized_force", f"{_PLANT}: input ports"),
-    "discrete_contact_approximation": base.Setting(
+    "coupling": base.Advised("held force, applied_generalized_force", f"{_PLANT}: input ports"),
+    "discrete_contact_approximation": base.Advised(
         "sap", f"{_PLANT}: DiscreteContactApproximation"
     ),
-    "sap_near_rigid_threshold": base.Setting("0", f"{_PLANT}: set_sap_near_rigid_threshold"),
-    "use_sampled_output_ports": base.Setting("False", f"{_PLANT}: SetUseSampledOutputPorts"),
+    "sap_near_rigid_threshold": base.Advised("0", f"{_PLANT}: set_sap_near_rigid_threshold"),
+    "use_sampled_output_ports": base.Advised("False", f"{_PLANT}: SetUseSampledOutputPorts"),
 }
 
 
@@ -63,11 +63,11 @@ class DrakeEngine:
 
     version = version("drake")
 
-    def __init__(self, name: str, contact_model: str, settings: Mapping[str, base.Setting]) -> None:
+    def __init__(self, name: str, contact_model: str, settings: Mapping[str, base.Advised]) -> None:
         """Takes its name, Drake's name of the contact model, and the settings of that model."""
         self.name = name
         self._contact_model = contact_model
-        self.settings: Mapping[str, base.Setting] = {**_SHARED, **settings}
+        self.settings: Mapping[str, base.Advised] = {**_SHARED, **settings}
 
     def open(self, task: base.Task, timestep: float) -> DrakeSimulation:
         """Opens a task; see ``Engine.open``."""
@@ -215,20 +215,20 @@ def _transform(pose: base.Pose) -> Any:
 
 def engines() -> tuple[base.Engine, ...]:
     """Returns the engines of this module."""
-    stiffness = base.Setting(f"{POINT_STIFFNESS:g} N/m", f"{_PROPERTIES}: point_stiffness")
+    stiffness = base.Advised(f"{POINT_STIFFNESS:g} N/m", f"{_PROPERTIES}: point_stiffness")
     point = {
         "point_contact_stiffness": stiffness,
-        "relaxation_time": base.Setting("0", f"{_PROPERTIES}: relaxation_time"),
+        "relaxation_time": base.Advised("0", f"{_PROPERTIES}: relaxation_time"),
     }
     hydroelastic = {
-        "compliance": base.Setting("free bodies compliant, fixed shapes rigid", _USER_GUIDE),
-        "hydroelastic_modulus": base.Setting(
+        "compliance": base.Advised("free bodies compliant, fixed shapes rigid", _USER_GUIDE),
+        "hydroelastic_modulus": base.Advised(
             f"{MODULUS:g} Pa", f"{_PROPERTIES}: hydroelastic_modulus"
         ),
-        "resolution_hint": base.Setting(
+        "resolution_hint": base.Advised(
             f"{RESOLUTION:g} of the radius", f"{_PROPERTIES}: resolution_hint"
         ),
-        "relaxation_time": base.Setting("1 timestep", f"{_PROPERTIES}: relaxation_time"),
+        "relaxation_time": base.Advised("1 timestep", f"{_PROPERTIES}: relaxation_time"),
     }
     return (
         DrakeEngine("drake_point", "point", point),

@@ -44,16 +44,16 @@ class MujocoEngine:
 
     name = "mujoco"
     version = mujoco.__version__
-    settings: Mapping[str, base.Setting] = {
-        "coupling": base.Setting(
+    settings: Mapping[str, base.Advised] = {
+        "coupling": base.Advised(
             "held force, xfrc_applied", "MuJoCo documentation, Computation: State"
         ),
-        "integrator": base.Setting("implicitfast", _OVERVIEW),
-        "cone": base.Setting("elliptic", _REFERENCE),
-        "solver": base.Setting("Newton, tolerance 1e-10", _REFERENCE),
-        "diagexact": base.Setting("enable", _REFERENCE),
-        "solref": base.Setting("2 timesteps, damping ratio 1", _MODELING),
-        "solimp": base.Setting("0.95 0.99 0.001 0.5 2", _MODELING),
+        "integrator": base.Advised("implicitfast", _OVERVIEW),
+        "cone": base.Advised("elliptic", _REFERENCE),
+        "solver": base.Advised("Newton, tolerance 1e-10", _REFERENCE),
+        "diagexact": base.Advised("enable", _REFERENCE),
+        "solref": base.Advised("2 timesteps, damping ratio 1", _MODELING),
+        "solimp": base.Advised("0.95 0.99 0.001 0.5 2", _MODELING),
     }
 
     def open(self, task: base.Task, timestep: float) -> MujocoSimulation:

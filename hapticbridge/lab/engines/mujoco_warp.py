@@ -31,11 +31,11 @@ class MujocoWarpEngine:
 
     name = "mujoco_warp"
     version = version("mujoco-warp")
-    settings: Mapping[str, base.Setting] = {
+    settings: Mapping[str, base.Advised] = {
         **MujocoEngine.settings,
-        "diagexact": base.Setting("not supported", "MuJoCo documentation, MuJoCo Warp"),
-        "device": base.Setting("cpu", "MuJoCo documentation, MuJoCo Warp"),
-        "precision": base.Setting("single (the only one)", "MuJoCo documentation, MuJoCo Warp"),
+        "diagexact": base.Advised("not supported", "MuJoCo documentation, MuJoCo Warp"),
+        "device": base.Advised("cpu", "MuJoCo documentation, MuJoCo Warp"),
+        "precision": base.Advised("single (the only one)", "MuJoCo documentation, MuJoCo Warp"),
     }
 
     def open(self, task: base.Task, timestep: float) -> MujocoWarpSimulation:

@@ -34,10 +34,10 @@ leans on gives way by 6.7, 3.9 and 2.1 mm at 2, 20 and 50 iterations of XPBD, an
 _GUIDE = "Newton documentation, Solvers"
 _COLLISIONS = "Newton documentation, Collisions"
 _SHARED = {
-    "coupling": base.Setting("held force, State.body_f", "Newton documentation, State"),
-    "device": base.Setting("cpu", "Newton documentation, Installation"),
-    "precision": base.Setting("single (the only one)", "Newton documentation, State"),
-    "gap": base.Setting(f"{GAP:g} m", f"{_COLLISIONS}: Margin and gap"),
+    "coupling": base.Advised("held force, State.body_f", "Newton documentation, State"),
+    "device": base.Advised("cpu", "Newton documentation, Installation"),
+    "precision": base.Advised("single (the only one)", "Newton documentation, State"),
+    "gap": base.Advised(f"{GAP:g} m", f"{_COLLISIONS}: Margin and gap"),
 }
 
 Solver = Callable[[Any], Any]
@@ -49,11 +49,11 @@ class NewtonEngine:
 
     version = version("newton")
 
-    def __init__(self, name: str, solver: Solver, settings: Mapping[str, base.Setting]) -> None:
+    def __init__(self, name: str, solver: Solver, settings: Mapping[str, base.Advised]) -> None:
         """Takes its name, the function that makes the solver, and the settings of the solver."""
         self.name = name
         self._solver = solver
-        self.settings: Mapping[str, base.Setting] = {**_SHARED, **settings}
+        self.settings: Mapping[str, base.Advised] = {**_SHARED, **settings}
 
     def open(self, task: base.Task, timestep: float) -> NewtonSimulation:
         """Opens a task; see ``Engine.open``."""
@@ -160,13 +160,13 @@ def engines() -> tuple[base.Engine, ...]:
         return newton.solvers.SolverSteel(model, iterations=STEEL_ITERATIONS)
 
     xpbd = {
-        "solver": base.Setting("XPBD", _GUIDE),
-        "iterations": base.Setting(f"{XPBD_ITERATIONS} (default 2)", _GUIDE),
+        "solver": base.Advised("XPBD", _GUIDE),
+        "iterations": base.Advised(f"{XPBD_ITERATIONS} (default 2)", _GUIDE),
     }
     steel = {
-        "solver": base.Setting("Steel (marked experimental)", _GUIDE),
-        "iterations": base.Setting(f"{STEEL_ITERATIONS} (default 12)", _GUIDE),
-        "angular damping": base.Setting("0 (default 0.05)", _GUIDE),
+        "solver": base.Advised("Steel (marked experimental)", _GUIDE),
+        "iterations": base.Advised(f"{STEEL_ITERATIONS} (default 12)", _GUIDE),
+        "angular damping": base.Advised("0 (default 0.05)", _GUIDE),
     }
     return (
         NewtonEngine("newton_xpbd", positions, xpbd),

@@ -242,17 +242,17 @@ class OdeEngine:
     """ODE with its direct solver."""
 
     name = "ode"
-    settings: Mapping[str, base.Setting] = {
-        "coupling": base.Setting("held force", f"{_MANUAL}: Rigid Body Functions, Mass and force"),
-        "step": base.Setting("dWorldStep (direct solver)", f"{_MANUAL}: World, Stepping Functions"),
-        "ERP": base.Setting("0.2 (default)", f"{_MANUAL}: Concepts, How To Use ERP and CFM"),
-        "CFM": base.Setting(f"{CFM:g}", f"{_MANUAL}: Concepts, How To Use ERP and CFM"),
-        "contact surface layer": base.Setting(
+    settings: Mapping[str, base.Advised] = {
+        "coupling": base.Advised("held force", f"{_MANUAL}: Rigid Body Functions, Mass and force"),
+        "step": base.Advised("dWorldStep (direct solver)", f"{_MANUAL}: World, Stepping Functions"),
+        "ERP": base.Advised("0.2 (default)", f"{_MANUAL}: Concepts, How To Use ERP and CFM"),
+        "CFM": base.Advised(f"{CFM:g}", f"{_MANUAL}: Concepts, How To Use ERP and CFM"),
+        "contact surface layer": base.Advised(
             f"{LAYER:g} m", f"{_MANUAL}: World, Contact Parameters"
         ),
-        "friction": base.Setting("dContactApprox1", f"{_MANUAL}: Joint Types, Contact"),
-        "rotation": base.Setting("finite", f"{_MANUAL}: Rigid Body Functions, Miscellaneous"),
-        "gyroscopic mode": base.Setting("on (default)", f"{_MANUAL}: Rigid Body Functions"),
+        "friction": base.Advised("dContactApprox1", f"{_MANUAL}: Joint Types, Contact"),
+        "rotation": base.Advised("finite", f"{_MANUAL}: Rigid Body Functions, Miscellaneous"),
+        "gyroscopic mode": base.Advised("on (default)", f"{_MANUAL}: Rigid Body Functions"),
     }
 
     @property
@@ -396,9 +396,9 @@ class OdeSpringEngine(OdeEngine):
     """ODE with an implicit coupling: a soft ball joint and a soft angular motor."""
 
     name = "ode_spring"
-    settings: Mapping[str, base.Setting] = {
+    settings: Mapping[str, base.Advised] = {
         **OdeEngine.settings,
-        "coupling": base.Setting(
+        "coupling": base.Advised(
             "implicit spring: ball joint and angular motor, CFM 1/(T K + B)",
             "ODE Manual: Concepts, How To Use ERP and CFM",
         ),

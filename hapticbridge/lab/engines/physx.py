@@ -67,26 +67,26 @@ class SapienEngine:
 
     name = "physx"
     version = f"PhysX 5 in SAPIEN {version('sapien')}"
-    settings: Mapping[str, base.Setting] = {
-        "coupling": base.Setting("held force", f"{_DYNAMICS}, Applying Forces"),
-        "solver": base.Setting("TGS", f"{_DYNAMICS}, Temporal Gauss-Seidel"),
-        "position iterations": base.Setting(
+    settings: Mapping[str, base.Advised] = {
+        "coupling": base.Advised("held force", f"{_DYNAMICS}, Applying Forces"),
+        "solver": base.Advised("TGS", f"{_DYNAMICS}, Temporal Gauss-Seidel"),
+        "position iterations": base.Advised(
             f"{POSITION_ITERATIONS}", f"{_DYNAMICS}, Solver Iterations"
         ),
-        "velocity iterations": base.Setting("1", f"{_DYNAMICS}, Solver Iterations"),
-        "contact offset": base.Setting(
+        "velocity iterations": base.Advised("1", f"{_DYNAMICS}, Solver Iterations"),
+        "contact offset": base.Advised(
             f"{CONTACT_OFFSET:g} m", f"{_COLLISION}, Tuning Shape Collision"
         ),
-        "rest offset": base.Setting("0", f"{_COLLISION}, Tuning Shape Collision"),
-        "contact generation": base.Setting("PCM", f"{_COLLISION}, PCM"),
-        "tolerances": base.Setting(
+        "rest offset": base.Advised("0", f"{_COLLISION}, Tuning Shape Collision"),
+        "contact generation": base.Advised("PCM", f"{_COLLISION}, PCM"),
+        "tolerances": base.Advised(
             f"length {LENGTH:g} m (default 1), speed {SPEED:g} m/s",
             "PhysX 5 API: PxTolerancesScale, which advises the size of the objects; "
             "chosen shorter, or PCM keeps normals of a pose that was left",
         ),
-        "friction": base.Setting("every iteration", f"{_DYNAMICS}, Friction"),
-        "sleep threshold": base.Setting("0", f"{_DYNAMICS}, Sleeping"),
-        "damping": base.Setting("0", f"{_DYNAMICS}, Damping"),
+        "friction": base.Advised("every iteration", f"{_DYNAMICS}, Friction"),
+        "sleep threshold": base.Advised("0", f"{_DYNAMICS}, Sleeping"),
+        "damping": base.Advised("0", f"{_DYNAMICS}, Damping"),
     }
 
     def open(self, task: base.Task, timestep: float) -> SapienSimulation:
@@ -182,9 +182,9 @@ class SapienSpringEngine(SapienEngine):
     """PhysX 5 with an implicit coupling: the drives of a D6 joint."""
 
     name = "physx_spring"
-    settings: Mapping[str, base.Setting] = {
+    settings: Mapping[str, base.Advised] = {
         **SapienEngine.settings,
-        "coupling": base.Setting(
+        "coupling": base.Advised(
             "implicit spring: D6 joint, linear and slerp drives", f"{_GUIDE}: Joints, D6 Joint"
         ),
     }

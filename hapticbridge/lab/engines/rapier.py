@@ -51,18 +51,18 @@ class RapierEngine:
 
     name = "rapier"
     version = version("rapier3d")
-    settings: Mapping[str, base.Setting] = {
-        "coupling": base.Setting("held force", f"{_GUIDE}: Rigid-bodies, Forces and impulses"),
-        "length unit": base.Setting(
+    settings: Mapping[str, base.Advised] = {
+        "coupling": base.Advised("held force", f"{_GUIDE}: Rigid-bodies, Forces and impulses"),
+        "length unit": base.Advised(
             f"{LENGTH:g} m (default 1)", f"{_PARAMETERS}, which advises the size of most parts"
         ),
-        "allowed linear error": base.Setting(f"{ALLOWED:g} of the unit", _PARAMETERS),
-        "contact softness": base.Setting(
+        "allowed linear error": base.Advised(f"{ALLOWED:g} of the unit", _PARAMETERS),
+        "contact softness": base.Advised(
             f"{STIFFNESS:g} of the step's rate, damping ratio 10 (default 30 Hz)", _PARAMETERS
         ),
-        "solver iterations": base.Setting(f"{ITERATIONS} (default 4)", _PARAMETERS),
-        "friction model": base.Setting("simplified (default)", _PARAMETERS),
-        "sleep": base.Setting("off", f"{_GUIDE}: Rigid-bodies, Sleeping"),
+        "solver iterations": base.Advised(f"{ITERATIONS} (default 4)", _PARAMETERS),
+        "friction model": base.Advised("simplified (default)", _PARAMETERS),
+        "sleep": base.Advised("off", f"{_GUIDE}: Rigid-bodies, Sleeping"),
     }
 
     def open(self, task: base.Task, timestep: float) -> RapierSimulation:
