@@ -331,9 +331,9 @@ class PassiveLine:
             return np.maximum(0.0, 2 * (self.b - self.share * damping) / self.period)
         # The requirement is convex in K, so secants from above never cross the line. They start
         # where ω → 0 alone requires b: (d + 1)² K² T/2 = b (K + 2B/T).
-        soft, share = SOFT * self.b / self.period, (self.delay + 1) ** 2
-        root = np.sqrt(self.b + 4 * share * damping) * np.sqrt(self.b)
-        before, last = ((self.b + root) / (self.period * share) * x for x in (1.1, 1.0))
+        soft, burden = SOFT * self.b / self.period, (self.delay + 1) ** 2
+        root = np.sqrt(self.b + 4 * burden * damping) * np.sqrt(self.b)
+        before, last = ((self.b + root) / (self.period * burden) * x for x in (1.1, 1.0))
         needed_before = self._needed(before, damping)
         for _ in range(SECANTS):
             needed = self._needed(last, damping)
