@@ -7,13 +7,15 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from audit_cases import ScriptedDevice
 from faults.catalogue import FINGERS
 from model_runs import LOOP_SCENES
 from numpy.typing import NDArray
-from own_device import OwnDevice
+from own_attacks import PINNED
+from own_device import Drive, OwnDevice
 from random_hands import random_motion
 from swing_cases import (
     ALARM,
@@ -635,3 +637,16 @@ def test_a_silence_of_the_device_is_named_in_summary_audit_and_live_line(tmp_pat
     assert "NO NEW SAMPLE for 0.4 s" in str(state)
     state.add(rows[700:])
     assert "once no new sample for 0.5 s" in str(state)
+
+
+@pytest.mark.parametrize("delay", [2, 0])
+def test_a_torque_that_slams_on_a_late_device_is_found(delay: int) -> None:
+    """It swings a grip of 5.6e-6 kg m² with 0.5 W for ever."""
+    drive = Drive(twist=0.2, inertia=5.6e-6, spring=2.12, damper=2.3e-5)
+    own: dict[str, Any] = {"rotational_damping": 2e-3, "torque_limit": 0.5, "start": (0.0, 0.0)}
+    device = OwnDevice((2000.0, 5.0), late=lambda _: delay, drive=drive, **own)
+    scene = hb.load_scene(mujoco.MjSpec.from_string(PINNED))
+    with hb.Bridge(scene, device, clock=hb.SimulatedClock()) as bridge:
+        summary = bridge.run(4.0)
+    assert summary.is_certified is (delay == 0)
+    assert device.gained <= (0.3 if delay else 1e-6)
