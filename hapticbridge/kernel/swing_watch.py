@@ -62,8 +62,8 @@ soft stop moves it along the force, by less than 2 mm. If it does not move again
 probe, r stays at the quarter until the handle is 2 mm away, and the flag ``UNANSWERED`` stays. On a
 soft stop the step of such a probe rings, so that c_s does not count until 0.3 s after it.
 
-A device with prescribed motion is not watched (``guard.guard_parameters_for``). ``hapticbridge guide
-faults`` has the margins and the limits of the method.
+A device with prescribed motion is not watched (``guard.guard_parameters_for``). The page ``faults``
+of the guide has the margins and the limits of the method.
 """
 
 from __future__ import annotations
