@@ -6,7 +6,7 @@ import pytest
 from adversary import UNPAID
 from own_attacks import KINDS, REFERENCES, attacked_on_device
 
-SEEDS, STEPS = range(29, 33), 5
+SEEDS, STEPS = range(29, 33), 3
 """Hands of a test, and their improvements; ``scripts/attack`` takes as many as it is asked for."""
 
 
