@@ -138,7 +138,7 @@ swings of an encoder with steps of 0.2 mm for slams. After one blow the missing 
 exp(−t/M), with M the memory of 0.3 s, and its average as (t/M) exp(−t/M): the share is kept for
 M/0.8 = 0.375 s, and ``LASTS`` is longer, so that a thrown hand that rings is no slam. In a swing
 that a force d late drives for ever, its work is (b + c) Σ v², with c the hand's damping; a hand of
-0.06 N s/m has a ratio of 1.02. A lower one takes blows on a stop for slams."""
+0.06 N s/m has a ratio of 1.02. At 0.5 hands that ring, and devices as late as stated, are slams."""
 
 SENT_LAGS, SWUNG = (0.0, 0.0, 0.001, 0.002), 25.0
 """Ages of forces in s, all but the first beyond a stated delay, and corner in Hz of their filter. A
