@@ -282,6 +282,21 @@ def test_bad_program_is_told(program: str, fault: Any, valid: bytes, words: str)
     assert bench.time.now < 15.0
 
 
+def test_a_piece_of_the_program_that_is_slow_to_return_loses_nothing(program: str) -> None:
+    bench = FalconBench(program=None, valid=PROGRAM)
+    take, held = bench.link.take, [0.5]  # s: a computer that is busy
+
+    def slow() -> list[bytes]:
+        if len(bench.model.uploaded) > 3000 and held:
+            bench.time.advance(bench.time.now + held.pop())
+            return []
+        return take()
+
+    bench.link.take = slow  # type: ignore[method-assign]
+    bench.opened(firmware=program).close()
+    assert (bench.model.uploaded, held) == (PROGRAM, [])
+
+
 def test_a_file_that_is_no_program_is_refused(tmp_path: Path) -> None:
     empty, large = tmp_path / "empty", tmp_path / "large"
     empty.write_bytes(b"")

@@ -182,9 +182,13 @@ bytes."""
 GREETINGS = 100
 """Number of greetings to the loader, as in libnifalcon, before the boot fails: 10 s in all."""
 
-ANSWER_TIME = 0.1
-"""Longest wait for one answer of the loader in s. The slowest answer, a piece of firmware at 140000
-baud, takes 9 ms on the line in both directions and up to 16 ms in the bridge."""
+GREETING_TIME = 0.1
+"""Longest wait for the answer to a greeting in s; a greeting without an answer is sent again."""
+
+PIECE_TIME = 2.0
+"""Longest wait for a piece of firmware to come back in s. At 140000 baud it takes 9 ms on the line
+in both directions and up to 16 ms in the bridge. The rest is for a computer that is busy: a piece
+that is given up loses the whole load."""
 
 PROBES = 20
 """Number of packets without a reply after which a Falcon counts as not running. The first packets
@@ -344,13 +348,13 @@ def _greet(link: Link, name: str) -> None:
     raise DeviceError(f"{name}: its loader does not answer; switch its power off and on")
 
 
-def _echo(link: Link, data: bytes, length: int | None = None) -> bytes:
-    """Sends bytes and returns the answer within ``ANSWER_TIME``, by default of equal length."""
-    wanted = len(data) if length is None else length
+def _echo(link: Link, data: bytes, greeting: int = 0) -> bytes:
+    """Sends bytes and returns what comes back: as many, or the ``greeting`` bytes of an answer."""
+    wanted, timeout = (greeting, GREETING_TIME) if greeting else (len(data), PIECE_TIME)
     link.write(array.array("B", data), _WRITE_MS)
-    end = link.now() + ANSWER_TIME
+    end = link.now() + timeout
     answer = b""
-    while len(answer.lstrip(b"\0") if length else answer) < wanted:
+    while len(answer.lstrip(b"\0") if greeting else answer) < wanted:
         if (left := end - link.now()) <= 0:
             break
         link.wait(left)
