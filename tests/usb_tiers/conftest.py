@@ -79,6 +79,9 @@ def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bears silent devices for longer on the wall clock: a busy machine stalls their processes."""
     if not IS_TIME_VIRTUAL:
         monkeypatch.setattr("hapticbridge.device.falcon.device.SILENCE", 5.0)
+        monkeypatch.setattr("hapticbridge.device.falcon.device._ANSWER_TIME", 1.0)
+        monkeypatch.setattr("hapticbridge.device.falcon.protocol.PROBE_TIME", 0.1)
+        monkeypatch.setattr("hapticbridge.device.falcon.protocol.PIECE_TIME", 30.0)
         monkeypatch.setattr("hapticbridge.device.watchdog.SILENCE", 5.0)
         monkeypatch.setattr("hapticbridge.demand.guard.PATIENCE", 30.0)
         monkeypatch.setattr("hapticbridge.device.transport.hid.MAX_WRITE", 5.0)
