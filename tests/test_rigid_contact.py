@@ -16,6 +16,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import METHODS, prepare
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.record import TICK_DTYPE
+from hapticbridge.kernel.rigid_contact import STALLED
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
 from hapticbridge.run.description import method_of
@@ -231,25 +232,33 @@ def test_a_jammed_peg_is_strict_where_the_contact_of_the_scene_creates_energy(co
         assert not strict(results["scene"]), (seed, mass, mu)
 
 
-PLANAR = PEG.replace(
-    "<freejoint/>",
-    '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint axis="0 1 0"/>',
-)
+def worst_gradient(run: Run, seed: int) -> float:
+    """Returns the largest gradient in m/s² with which the solver ended a tick of a jam."""
+    worst = [0.0]
+
+    def note(_: object, data: mujoco.MjData) -> None:
+        for island in range(max(data.nisland, 1)):
+            if (count := int(data.solver_niter[island])) > 0:
+                last = island * mujoco.mjNSOLVER + min(count, mujoco.mjNSOLVER) - 1
+                worst.append(float(data.solver.gradient[last]))
+
+    go_on(run, jamming(seed), after_tick=note)
+    return max(worst)
 
 
-@pytest.mark.parametrize("seed", [1, 26])
+@pytest.mark.parametrize("seed", [39, 140])
 def test_a_solution_that_does_not_converge_is_replaced_by_one_that_does(seed: int) -> None:
-    """Newton's method goes round in circles in these jams, or stops with a gradient of 200."""
+    """Newton's method goes round in circles in these jams."""
     results = {}
     for stalled in (None, np.inf):
-        run = prepared(scene(PLANAR, mass=0.03, mu=2.0), coupling=Coupling(6000.0, 0.5, 6.0, 5e-4))
+        run = prepared(scene(PEG, mass=0.03, mu=1.0), coupling=Coupling(6000.0, 0.5, 6.0, 5e-4))
         if stalled is not None:
             run.binding.state["contact"]["stalled"] = stalled
         own = run.scene.model.opt.solver
-        results[stalled] = through(run, jamming(seed))
+        results[stalled] = worst_gradient(run, seed)
         assert run.scene.model.opt.solver == own
-    assert strict(results[None])
-    assert not strict(results[np.inf])
+        assert strict(run)
+    assert results[None] <= STALLED < results[np.inf]
 
 
 @pytest.mark.parametrize(("iterations", "line_search"), [(100, 10), (3, 50), (3, 5)])

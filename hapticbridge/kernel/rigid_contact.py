@@ -29,6 +29,19 @@ C. If it recedes by δ, ŵ is smaller by δ/h: a body that rests on it follows, 
 that port. All this holds for any ŵ <= 0 in a gap. A contact therefore only has to be known before
 it closes: margins follow the speed (``follow_speed``).
 
+A contact is *blocked* if no joint can answer along its normal, J M⁻¹ Jᵀ of its normal row being at
+most ``BLOCKED`` of that of its friction: a puck on two slides, a drawer on its runners. The law
+above would hold it with any force, and its cone with it. Its normal force N is that of the scene's
+own ``solref`` and ``solimp`` at the depth p at rest,
+
+    N = K d² p/((1 − d) A),    ŵ = h R N − μ|v_t⁺|,    R = 4 n μ² J_t M⁻¹ J_tᵀ
+
+A is MuJoCo's approximate inverse inertia (``body_invweight0``), K and d are its stiffness and
+impedance, n is the number of such contacts. One that only touches gives no force. None does work
+along its normal, and friction takes energy; where the tank says otherwise the step is repeated
+with the law of other contacts. The exact inverse inertia of such a row is 0, so a step
+with one uses the approximate ones for all.
+
 Limits of joints and tendons are rows like those of a contact without friction. An equality
 constraint has ŵ = −σ β p/h − (1 − σ) δp/h for an error p of either sign; δp is the part of p that a
 moved mocap body added. All these rows share the tank, so the tank also pays for an error that
@@ -113,6 +126,17 @@ RESERVE = 1e-7
 """Energy in J of the tank that is never spent; it covers rounding and the remainder of the
 integration."""
 
+BLOCKED = 1e-6
+"""Largest mobility along the normal of a blocked contact over that along the surface, without unit:
+a normal that a joint's motion meets at 1 mrad from a right angle. More would let the force of such
+a contact do work, and the step be solved twice."""
+
+FORCE_ERROR = 0.02
+"""Largest error of a blocked contact's normal force, without unit, before the step is repeated."""
+
+OPEN = -1e3
+"""Wanted velocity in m/s of a blocked contact without force. No sliding closes it."""
+
 _EXACT = 1e-9
 """ε of the module's equations, without unit: the spring that is left in the row of a contact, and
 the velocity that is left in the rows of friction."""
@@ -133,6 +157,12 @@ _SOLVER = struct_of("mjModel").opt.offset + struct_of("mjOption").solver.offset
 
 _GRADIENT, _STATISTIC = struct_of("mjSolverStat").gradient.offset, sizeof(struct_of("mjSolverStat"))
 
+_EXACT_DIAGONAL = int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT)
+
+_SLIGHT = 1e-6
+"""Mobility along the normal over that of the body, and over ``BLOCKED``, below which a contact
+without friction is blocked; no unit."""
+
 _BALL = int(mujoco.mjtJoint.mjJNT_BALL)
 
 _MAX_KEPT = int(mujoco.mjNSOLVER)
@@ -149,12 +179,13 @@ _PARAMETERS = (
 _OF_MODEL = (
     *("geom_rbound", "pair_geom1", "pair_geom2", "jnt_type", "jnt_dofadr"),
     *("body_parentid", "body_rootid", "body_dofadr", "body_dofnum"),
+    *("body_invweight0", "dof_invweight0"),
 )
 _OF_DATA = ("geom_xpos", "subtree_com", "cdof", "ten_velocity")
 _OWNED = (
     *(f"own_{name}" for name in _PARAMETERS),
     *("eq_type", "row_positions", "row_shifts", "end_velocity", "moving_geoms", "body_velocity"),
-    "leashes",
+    *("leashes", "blocked"),
 )
 
 RIGID_DTYPE = np.dtype(
@@ -165,6 +196,8 @@ RIGID_DTYPE = np.dtype(
         ("is_aimed", "<i8"),
         ("corrections", "<i8"),
         ("is_shifted", "<i8"),
+        ("pressing", "<i8"),
+        ("is_sparse", "<i8"),
         ("leads", "<i8"),
         ("solver", "<i8"),
         ("own_solver", "<i8"),
@@ -191,8 +224,10 @@ the last tick. ``is_aimed`` is 1 from the edit to the end of the step, ``correct
 repetitions for sliding, and ``lift`` is the largest velocity in m/s subtracted for it; ``ahead``
 the time in s for which margins reach ahead, and ``largest_margin`` their largest in m. ``leads`` is
 1 if the tool's margins follow the handle's speed, too. ``is_shifted`` is 1 if the step was repeated
-without −h J̇v. ``solver`` is the address of MuJoCo's choice, ``own_solver`` that of the scene;
-``stalled`` is ``STALLED``. Of limits and equality constraints: largest count of rows (0 if there
+without −h J̇v. ``pressing`` counts the blocked contacts in penetration, and ``blocked`` is the
+address of h R N of each row in m/s, −1 where it is none; ``is_sparse`` is 1 if MuJoCo's Jacobian
+is. ``solver`` is the address of MuJoCo's choice, ``own_solver`` that of the scene; ``stalled`` is
+``STALLED``. Of limits and equality constraints: largest count of rows (0 if there
 are none), and addresses of the model's parameters, of copies, of the rows' own positions, of the
 velocities taken from ŵ and of J v⁺. Of margins: addresses and counts of the geoms that move, of
 pairs, and of the bodies' velocities; ``leashes`` is 1 for spatial tendons of no least length."""
@@ -212,6 +247,7 @@ def bind_contact(
     contact["statistics"] = data._address + struct_of("mjData").solver.offset
     contact["warmstart"] = data.qacc_warmstart.ctypes.data
     contact["stalled"] = STALLED
+    contact["is_sparse"] = mujoco.mj_isSparse(model)
     is_rigid = model.eq_type <= LAST_RIGID
     if np.any(is_rigid) or np.any(model.jnt_limited) or np.any(model.tendon_limited):
         flex_rows = data.ne if np.any(~is_rigid) else 0
@@ -226,7 +262,7 @@ def bind_contact(
         owned[name] = np.zeros(max(int(contact["row_capacity"]), 1))
     is_spatial = model.wrap_type[model.tendon_adr] != mujoco.mjtWrap.mjWRAP_JOINT
     owned["leashes"] = (is_spatial & (model.tendon_range[:, 0] <= 0.0)).astype(np.int32)
-    owned["end_velocity"] = np.zeros(MAX_ROWS)
+    owned["end_velocity"], owned["blocked"] = np.zeros(MAX_ROWS), np.zeros(MAX_ROWS)
     meets = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     meets[model.pair_geom1] = meets[model.pair_geom2] = True
     is_moving = model.body_weldid[model.geom_bodyid] > 0
@@ -254,12 +290,12 @@ def _aim(s: State) -> None:
     if s.contact.row_capacity > 0:
         _aim_rows(s)
     mj, h, push = s.mj, s.run.timestep, s.contact.push_ratio * DEPENETRATION
-    d = _IMPEDANCE
     count = ints(mj.nefc, 1)[0]
     velocities = floats(pointer_at(mj.efc_vel), count)
     positions = floats(pointer_at(mj.efc_pos), count)
     margins = floats(pointer_at(mj.efc_margin), count)
     ends = floats(s.contact.end_velocity, MAX_ROWS)
+    blocked = floats(s.contact.blocked, MAX_ROWS)
     contacts = pointer_at(mj.contact)
     s.contact.lift = 0.0
     for c in range(ints(mj.ncon, 1)[0]):
@@ -282,16 +318,107 @@ def _aim(s: State) -> None:
         lift = max(math.sqrt(slide) - friction[0] ** 2 * stop, 0.0)
         if s.contact.corrections > 0:
             lift = min(lift, math.sqrt(rest))
-        s.contact.lift = max(s.contact.lift, lift)
-        wanted -= lift
+        solimp, d = floats(contact + mj.contact_solimp, 2), _IMPEDANCE
+        if row < MAX_ROWS and blocked[row] >= 0.0:
+            slip = math.sqrt(rest if s.contact.corrections > 0 else slide)
+            wanted = blocked[row] - slip if blocked[row] > 0.0 else OPEN
+            d = solimp[0]
+        else:
+            s.contact.lift = max(s.contact.lift, lift)
+            wanted -= lift
         positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
         margins[row] = 0.0
         solref = floats(contact + mj.contact_solref, 2)
         solref[0], solref[1] = -_EXACT * d * d, -d / h
         solref = floats(contact + mj.contact_solreffriction, 2)
         solref[0], solref[1] = 0.0, -d / (_EXACT * h)
-        solimp = floats(contact + mj.contact_solimp, 2)
         solimp[0] = solimp[1] = d
+
+
+@compiled
+def _mobility(s: State, row: int) -> float:
+    """Returns about J M⁻¹ Jᵀ of a row, with MuJoCo's ``dof_invweight0`` for M⁻¹."""
+    mj, total = s.mj, 0.0
+    weights = floats(s.contact.dof_invweight0, mj.nv)
+    if s.contact.is_sparse:
+        first = ints(pointer_at(mj.efc_J_rowadr), row + 1)[row]
+        count = ints(pointer_at(mj.efc_J_rownnz), row + 1)[row]
+        values = floats(pointer_at(mj.efc_J) + 8 * first, count)
+        for k, dof in enumerate(ints(pointer_at(mj.efc_J_colind) + 4 * first, count)):
+            total += values[k] ** 2 * weights[dof]
+    else:
+        for dof, value in enumerate(floats(pointer_at(mj.efc_J) + 8 * row * mj.nv, mj.nv)):
+            total += value**2 * weights[dof]
+    return total
+
+
+@compiled
+def _stiffness_over_inertia(s: State, contact: int, depth: float) -> float:
+    """Returns K d²/(1 − d) in 1/s² of a contact's own ``solref`` and ``solimp`` at a depth in m."""
+    solref = floats(contact + s.mj.contact_solref, 2)
+    solimp = floats(contact + s.mj.contact_solimp, 5)
+    start, last = min(max(solimp[0], 1e-4), 0.9999), min(max(solimp[1], 1e-4), 0.9999)
+    middle, power = min(max(solimp[3], 1e-4), 0.9999), max(solimp[4], 1.0)
+    part = min(depth / solimp[2], 1.0) if solimp[2] > 0.0 else 1.0
+    if part <= middle:
+        rise = part**power / middle ** (power - 1.0)
+    else:
+        rise = 1.0 - (1.0 - part) ** power / (1.0 - middle) ** (power - 1.0)
+    d = start + rise * (last - start)
+    stiffness = -solref[0] / last**2
+    if solref[0] > 0.0:
+        stiffness = 1.0 / (last * max(solref[0], 2.0 * s.run.timestep) * solref[1]) ** 2
+    return stiffness * d**2 / (1.0 - d)
+
+
+@compiled
+def _blocked_mobility(s: State, contact: int) -> float:
+    """Returns J_t M⁻¹ J_tᵀ of a blocked contact in penetration, 0 of one in a gap, −1 of others."""
+    mj = s.mj
+    weights, bodies = (
+        floats(s.contact.body_invweight0, 2 * mj.nbody),
+        ints(mj.geom_bodyid, mj.ngeom),
+    )
+    row, geoms = ints(contact + mj.contact_row, 1)[0], ints(contact + mj.contact_geoms, 2)
+    if min(geoms[0], geoms[1]) < 0:  # of a flex
+        return -1.0
+    # without friction a contact may be slippery, not blocked
+    sideways = _SLIGHT * (weights[2 * bodies[geoms[0]]] + weights[2 * bodies[geoms[1]]])
+    for j in range(1, min(ints(contact + mj.contact_dim, 1)[0], 3)):  # those that slide
+        sideways = max(sideways, _mobility(s, row + j))
+    if _mobility(s, row) > BLOCKED * sideways:
+        return -1.0
+    return sideways if floats(contact + mj.contact_distance, 1)[0] < 0.0 else 0.0
+
+
+@compiled
+def _note_blocked(s: State) -> None:
+    """Notes the contacts along whose normal no joint can answer, and their h R N in m/s."""
+    mj, h, contacts = s.mj, s.run.timestep, pointer_at(s.mj.contact)
+    blocked = floats(s.contact.blocked, MAX_ROWS)
+    weights, bodies = (
+        floats(s.contact.body_invweight0, 2 * mj.nbody),
+        ints(mj.geom_bodyid, mj.ngeom),
+    )
+    s.contact.pressing = 0
+    for c in range(ints(mj.ncon, 1)[0]):
+        contact = contacts + c * mj.contact_size
+        row, dim = ints(contact + mj.contact_row, 1)[0], ints(contact + mj.contact_dim, 1)[0]
+        if 0 <= row <= MAX_ROWS - dim:
+            blocked[row] = _blocked_mobility(s, contact)
+            s.contact.pressing += blocked[row] > 0.0
+    for c in range(ints(mj.ncon, 1)[0] if s.contact.pressing else 0):
+        contact = contacts + c * mj.contact_size
+        row, geoms = ints(contact + mj.contact_row, 1)[0], ints(contact + mj.contact_geoms, 2)
+        if 0 <= row < MAX_ROWS and blocked[row] > 0.0:
+            approximate = weights[2 * bodies[geoms[0]]] + weights[2 * bodies[geoms[1]]]
+            depth = -floats(contact + mj.contact_distance, 1)[0]
+            squared = max(floats(contact + mj.contact_friction, 1)[0] ** 2, SOFTNESS)
+            regularisation = 4.0 * s.contact.pressing * squared * blocked[row]
+            force = _stiffness_over_inertia(s, contact, depth) * depth / approximate
+            blocked[row] = h * regularisation * force
+            solimp = floats(contact + mj.contact_solimp, 1)
+            solimp[0] = approximate / (approximate + 2.0 * regularisation)
 
 
 @compiled
@@ -398,6 +525,19 @@ def _restore_rows(s: State) -> None:
 
 
 @compiled
+def _unblock(s: State) -> bool:
+    """Gives blocked contacts the law of the others; returns True if there were any with a force."""
+    contact = s.contact
+    if not contact.pressing:
+        return False
+    blocked = floats(contact.blocked, MAX_ROWS)
+    blocked[:] = -1.0
+    contact.pressing = 0
+    ints(s.mj.enableflags, 1)[0] |= _EXACT_DIAGONAL
+    return True
+
+
+@compiled
 def aim_contacts(s: State) -> None:
     """Makes contacts, limits and equality constraints of the coming ``mj_step2`` rigid.
 
@@ -409,6 +549,9 @@ def aim_contacts(s: State) -> None:
         contact.push_ratio = 1.0 if has_energy else 0.0
         contact.corrections = contact.is_shifted = contact.is_aimed = 0
         ints(contact.solver, 1)[0] = contact.own_solver
+        _note_blocked(s)
+        if contact.pressing:
+            ints(s.mj.enableflags, 1)[0] &= ~_EXACT_DIAGONAL
         _aim(s)
         contact.is_aimed = 1
 
@@ -484,6 +627,32 @@ def _has_sunk(s: State) -> bool:
 
 
 @compiled
+def _misses_force(s: State) -> bool:
+    """Returns True if a blocked contact pressed with another force than its N in the step."""
+    mj, h, contact = s.mj, s.run.timestep, s.contact
+    count = ints(mj.nefc, 1)[0]
+    if not contact.pressing or count > MAX_ROWS:
+        return False
+    mj_mul_jac(mj.model, mj.data, contact.end_velocity, mj.qvel)
+    ends, contacts = floats(contact.end_velocity, count), pointer_at(mj.contact)
+    blocked, positions = floats(contact.blocked, MAX_ROWS), floats(pointer_at(mj.efc_pos), count)
+    velocities = floats(pointer_at(mj.efc_vel), count)
+    for c in range(ints(mj.ncon, 1)[0]):
+        one = contacts + c * mj.contact_size
+        row = ints(one + mj.contact_row, 1)[0]
+        if row < 0 or blocked[row] <= 0.0:
+            continue
+        friction, slip = floats(one + mj.contact_friction, 5), 0.0
+        for j in range(1, ints(one + mj.contact_dim, 1)[0]):
+            slip += (friction[j - 1] * ends[row + j]) ** 2
+        d = floats(one + mj.contact_solimp, 1)[0]
+        wanted = 0.5 * (velocities[row] - positions[row] * _EXACT * h * d)
+        if abs(wanted + math.sqrt(slip) - blocked[row]) > FORCE_ERROR * blocked[row]:
+            return True
+    return False
+
+
+@compiled
 def aim_again(s: State) -> bool:
     """Corrects the step that just ended: a solution that converges, less sinking, or less push.
 
@@ -498,7 +667,7 @@ def aim_again(s: State) -> bool:
     if _change_solver(s):
         contact.repetitions += 1
         return True
-    if contact.corrections < MAX_CORRECTIONS and _has_sunk(s):
+    if contact.corrections < MAX_CORRECTIONS and (_has_sunk(s) or _misses_force(s)):
         contact.corrections += 1
         contact.repetitions += 1
         _aim(s)
@@ -506,7 +675,7 @@ def aim_again(s: State) -> bool:
     allowed, returned = max(_spendable(s), 0.0), returned_energy(s)
     if s.energy.mocap_has_moved:
         allowed += mocap_work(s)  # the external port pays for it
-    if returned <= allowed or not (_shift_rows(s) or contact.push_ratio > 0.0):
+    if returned <= allowed or not (_unblock(s) or _shift_rows(s) or contact.push_ratio > 0.0):
         return False
     # C is nearly proportional to the share while the forces stay; a second excess ends it
     is_first = contact.push_ratio == 1.0 and allowed > 0.0
@@ -522,6 +691,8 @@ def finish_contacts(s: State) -> None:
     mj = s.mj
     if s.contact.is_aimed and s.contact.row_capacity > 0:
         _restore_rows(s)
+    if s.contact.is_aimed and s.contact.pressing:
+        ints(mj.enableflags, 1)[0] |= _EXACT_DIAGONAL
     s.contact.is_aimed = 0
     ints(s.contact.solver, 1)[0] = s.contact.own_solver
     count = ints(mj.nefc, 1)[0]
