@@ -21,7 +21,7 @@ from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.scene import Scene, SceneSource, plain_model
-from hapticbridge.scene.compile import START_KEYFRAME
+from hapticbridge.scene.compile import reset
 from hapticbridge.units import format_si
 
 SECONDS = 0.5
@@ -155,9 +155,7 @@ class _FileMotion:
         """Moves the scene; returns None if it diverges."""
         model = plain_model(source)
         data = mujoco.MjData(model)
-        home = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME)
-        if home >= 0:
-            mujoco.mj_resetDataKeyframe(model, data, home)
+        reset(model, data)
         mujoco.mj_forward(model, data)
         start, step = data.xipos.copy(), float(model.opt.timestep)
         most = MAX_WORK / max(model.nv + data.nefc, 1)

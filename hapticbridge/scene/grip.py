@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.codes import Grip
-from hapticbridge.scene.compile import START_KEYFRAME, compiled
+from hapticbridge.scene.compile import compiled, reset
 from hapticbridge.scene.source import SourceFile
 
 MAX_OFFERED = 4
@@ -74,9 +74,7 @@ def grips(model: mujoco.MjModel) -> tuple[Candidate, ...]:
         model: The scene without a handle.
     """
     data = mujoco.MjData(model)
-    key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME)
-    if key >= 0:
-        mujoco.mj_resetDataKeyframe(model, data, key)
+    reset(model, data)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     depths = np.zeros(model.nbody)

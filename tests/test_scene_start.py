@@ -1,0 +1,139 @@
+"""Start of a scene on its limits and equality constraints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from outside_scenes import scene_file
+
+import hapticbridge as hb
+from hapticbridge.scene import load_scene
+from hapticbridge.scene.scene import Scene
+
+TOOL = """<body name="tool" pos=".5 0 .1"><freejoint/>
+  <geom type="box" size=".02 .02 .02" mass=".1"/><site name="grip"/></body>"""
+ARM = """<body name="{0}" pos="0 {1} .5" gravcomp="1">
+  <joint name="{0}" axis="0 1 0" damping=".01" {2}/>
+  <geom type="capsule" fromto="0 0 0 .2 0 0" size=".01" mass=".1"/></body>"""
+PART = '<body name="part" pos="0 0 .1"><freejoint/><geom size=".02" mass=".1"/></body>'
+DRIVEN = '<body name="{0}" pos="{1} 0 0"><joint name="{0}" type="slide"/><geom size=".02"/></body>'
+
+
+def scene_text(bodies: str, rest: str = "") -> str:
+    return f"<mujoco><worldbody>{TOOL}{bodies}</worldbody>{rest}</mujoco>"
+
+
+def started_said(scene: Scene) -> list[str]:
+    return [change for change in scene.changes if change.startswith("start of")]
+
+
+def error(scene: Scene) -> float:
+    """Largest violation of MuJoCo's own rows at the start."""
+    data = scene.data
+    is_equality = data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+    return float(np.where(is_equality, np.abs(data.efc_pos), -data.efc_pos).max(initial=0.0))
+
+
+BEYOND = scene_text(ARM.format("elbow", 0, 'range="20 90"'))
+GEARED = scene_text(
+    ARM.format("j1", 0, "") + ARM.format("j2", 0.5, ""),
+    '<equality><joint joint1="j1" joint2="j2" polycoef=".5 1 0 0 0"/></equality>',
+)
+WELDED = scene_text(
+    PART, '<equality><weld name="hold" body1="part" relpose="0 0 .05 1 0 0 0"/></equality>'
+)
+PINNED = scene_text(
+    PART, '<equality><connect body1="part" body2="tool" anchor="0 0 .2"/></equality>'
+    '<keyframe><key name="home" qpos=".5 0 .1 1 0 0 0 0 .1 .1 1 0 0 0"/></keyframe>',
+)  # fmt: skip
+CORDED = scene_text(
+    PART.replace("</body>", '<site name="b"/></body><site name="a" pos="0 0 .4"/>'),
+    '<tendon><spatial name="cord" range="0 .2"><site site="a"/><site site="b"/></spatial></tendon>',
+)
+
+CASES = {
+    BEYOND: ["start of joint 'elbow': 0 deg → 20 deg, its limit"],
+    GEARED: [
+        "start of joint equality of joint 'j1' and 'j2': 28.6 deg off → closed",
+        "start of joint 'j1': 0 deg → 14.3 deg",
+        "start of joint 'j2': 0 deg → -14.3 deg",
+    ],
+    WELDED: [
+        "start of weld 'hold' of body 'part': 150 mm off → closed",
+        "start of body 'part': moved by 150 mm",
+    ],
+    PINNED: [
+        "start of connect of body 'part' and 'tool': 100 mm off → closed",
+        "start of body 'tool': turned by 8.56 deg",
+        "start of body 'part': turned by 5.91 deg",
+    ],
+    CORDED: [
+        "start of tendon 'cord': 100 mm beyond its limit → closed",
+        "start of body 'part': moved by 100 mm",
+    ],
+}
+
+
+@pytest.mark.parametrize("text", CASES)
+def test_violated_constraint_is_closed_before_the_run_and_said(tmp_path: Path, text: str) -> None:
+    scene = load_scene(scene_file(tmp_path, text))
+    assert error(scene) < 1e-8
+    assert started_said(scene) == CASES[text]
+    # the file itself starts with the violation
+    with pytest.warns(UserWarning, match="and stays so"):
+        assert error(load_scene(scene_file(tmp_path, text), as_is=True)) > 0.05
+
+
+def test_closed_start_is_what_the_scenes_own_soft_law_comes_to(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, GEARED))
+    model = mujoco.MjModel.from_xml_string(GEARED.replace('damping=".01"', 'damping=".001"'))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 5000)
+    assert scene.data.qpos[7:] == pytest.approx(data.qpos[7:], abs=5e-3)
+
+
+def test_run_its_reset_and_its_audit_start_on_the_constraints(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, GEARED))
+    with hb.Bridge(
+        scene, "simulated", clock=hb.SimulatedClock(), recording=tmp_path / "run.mcap"
+    ) as bridge:
+        bridge.run(duration=0.2)
+    mujoco.mj_resetData(scene.model, scene.data)
+    scene.reset()
+    assert error(scene) < 1e-8
+    report = hb.audit(tmp_path / "run.mcap")
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+def test_carried_tool_keeps_the_closed_start(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, BEYOND))
+    scene.carry_tool("asked for")
+    assert scene.data.joint("elbow").qpos[0] == pytest.approx(np.deg2rad(20.0))
+
+
+def test_constraint_that_cannot_be_closed_is_left_and_said(tmp_path: Path) -> None:
+    far = GEARED.replace('damping=".01" ', 'damping=".01" range="-5 5"')
+    with pytest.warns(UserWarning, match="joint equality of joint 'j1' and 'j2' starts 28.6 deg"):
+        scene = load_scene(scene_file(tmp_path, far))
+    assert not started_said(scene)
+    assert not scene.data.qpos[7:].any()
+
+
+def test_start_on_its_constraints_adds_nothing_to_the_scene(tmp_path: Path) -> None:
+    good = BEYOND.replace('range="20 90"', 'range="-20 90"')
+    scene = load_scene(scene_file(tmp_path, good))
+    assert (scene.model.nkey, started_said(scene)) == (0, [])
+    closed = load_scene(scene_file(tmp_path, BEYOND))
+    assert closed.model.key(0).name == "home"
+    assert np.array_equal(closed.data.mocap_pos[-1], closed.data.site("grip").xpos)
+
+
+def test_servo_of_a_closed_start_keeps_its_own_target(tmp_path: Path) -> None:
+    text = BEYOND.replace(
+        "</worldbody>", '</worldbody><actuator><position joint="elbow" kp="5"/></actuator>'
+    )
+    scene = load_scene(scene_file(tmp_path, text))
+    assert scene.data.ctrl[0] == 0.0
