@@ -37,6 +37,7 @@ from hapticbridge.scene.handle import (
     exclude_nested,
     limit_motors_alone,
     set_options,
+    take_over_mocap,
 )
 from hapticbridge.scene.parameters import apply_parameters
 from hapticbridge.scene.scene import Scene
@@ -297,6 +298,9 @@ def compile_scene(
         concerns = [*source.concerns, *about_grip]
         for each in dict.fromkeys(grips):
             concerns += check_model(model, each)
+        for each in dict.fromkeys(grips):
+            replaced, holding = take_over_mocap(spec, model, each, as_is=as_is)
+            changes, concerns = changes + replaced, [*concerns, *holding]
         model, started, remaining = _start_set(spec, model, source, as_is=as_is)
         changes, concerns = changes + started, [*concerns, *remaining]
         seat_handle(model, grips[0])
