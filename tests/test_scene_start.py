@@ -137,3 +137,69 @@ def test_servo_of_a_closed_start_keeps_its_own_target(tmp_path: Path) -> None:
     )
     scene = load_scene(scene_file(tmp_path, text))
     assert scene.data.ctrl[0] == 0.0
+
+
+# Mocap bodies that hold the grip
+
+HELD = """<mujoco><worldbody>
+  <body name="target" mocap="true" pos="0 0 .2"/>
+  <body name="far" mocap="true" pos="1 0 .2"/>
+  <body name="palm" pos="0 0 .2" gravcomp="1"><freejoint/>
+    <geom type="box" size=".03 .03 .03" mass=".2"/><site name="palm_site"/>
+    <body name="finger" pos="0 0 .05" gravcomp="1"><joint type="slide" axis="1 0 0"/>
+      <geom size=".01" mass=".02" contype="0" conaffinity="0"/></body>
+    <body name="lever" pos="0 0 -.05" gravcomp="1"><joint axis="0 1 0"/><joint axis="1 0 0"/>
+      <geom size=".01" pos="0 0 -.1" mass=".02" contype="0" conaffinity="0"/></body></body>
+  <body name="other" pos="1 0 .2" gravcomp="1"><freejoint/><geom size=".02" mass=".1"/></body>
+  </worldbody><equality><weld body1="far" body2="other"/>{}</equality></mujoco>"""
+WELD = '<weld body1="target" body2="palm"/>'
+CONNECT = '<connect name="pin" body1="palm" body2="target" anchor="0 0 0"/>'
+REPLACED = "grip held by mocap body 'target' → by the hand alone"
+
+
+def tool_way(scene: Scene) -> float:
+    """Way in m that the grip follows a hand that moves by its slow path."""
+    scene_grip = scene.grip
+    with hb.Bridge(scene, "simulated", clock=hb.SimulatedClock()) as bridge:
+        before = scene.data.site(scene_grip).xpos.copy()
+        bridge.run(duration=1.0)
+        return float(np.linalg.norm(scene.data.site(scene_grip).xpos - before))
+
+
+@pytest.mark.parametrize(("grip", "holding"), [("palm", WELD), ("finger", WELD), ("palm", CONNECT)])
+def test_hand_takes_the_place_of_the_mocap_body_that_holds_its_grip(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grip: str, holding: str
+) -> None:
+    path = scene_file(tmp_path, HELD.format(holding))
+    scene = load_scene(path, grip=grip)
+    assert REPLACED in scene.changes
+    assert scene.model.eq_active0.tolist() == [1, 0]
+    assert tool_way(scene) > 1e-3
+    # beside the constraint, the palm stays where it is
+    monkeypatch.setattr("hapticbridge.scene.load.take_over_mocap", lambda *_, **__: ((), []))
+    if grip == "palm":
+        assert tool_way(load_scene(path, grip=grip)) < 1e-5
+    monkeypatch.undo()
+    with pytest.raises(hb.SceneError, match="held in place by mocap body 'target'; write active="):
+        load_scene(path, grip=grip, as_is=True)
+
+
+def test_run_without_the_mocap_body_it_replaces_is_audited_bit_for_bit(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, HELD.format(WELD)), grip="palm")
+    scene.carry_tool("asked for")
+    assert not scene.model.eq_active0[1]
+    with hb.Bridge(
+        scene, "simulated", clock=hb.SimulatedClock(), recording=tmp_path / "run.mcap"
+    ) as bridge:
+        bridge.run(duration=0.2)
+    assert hb.audit(tmp_path / "run.mcap").resimulation == "bit for bit"
+
+
+def test_mocap_body_beside_which_the_grip_moves_is_left_and_named(tmp_path: Path) -> None:
+    path = scene_file(tmp_path, HELD.format(WELD))
+    with pytest.warns(UserWarning, match="'target' holds the tool and leaves the grip 2 of 6 of"):
+        scene = load_scene(path, grip="lever")
+    assert scene.model.eq_active0.all()
+    assert REPLACED not in scene.changes
+    # of two mocap bodies, the one that holds the other body is never named
+    assert not any("far" in change for change in load_scene(path, grip="palm").changes)
