@@ -1,4 +1,4 @@
-"""Start of a scene on its limits and equality constraints."""
+"""Start of a scene: violated constraints, mocap bodies that hold the grip, carried loads."""
 
 from __future__ import annotations
 
@@ -203,3 +203,81 @@ def test_mocap_body_beside_which_the_grip_moves_is_left_and_named(tmp_path: Path
     assert REPLACED not in scene.changes
     # of two mocap bodies, the one that holds the other body is never named
     assert not any("far" in change for change in load_scene(path, grip="palm").changes)
+
+
+# Overlaps and loads, in words that are true
+
+PAIR = """<body name="link" pos="1 0 .3"><joint axis="0 1 0"/><geom name="a" size=".05"/>
+  <body><joint axis="1 0 0"/><geom size=".001" mass=".1"/>
+    <body name="nested" pos="0 0 .06"><joint axis="0 1 0"/><geom name="b" size=".02"/></body>
+  </body></body>"""
+
+
+@pytest.mark.parametrize("is_explicit", [False, True])
+def test_only_a_contact_that_an_exclusion_ends_is_said_to_be_off(
+    tmp_path: Path, *, is_explicit: bool
+) -> None:
+    pair = '<contact><pair geom1="b" geom2="a"/></contact>' if is_explicit else ""
+    scene = load_scene(scene_file(tmp_path, scene_text(PAIR, pair)))
+    assert scene.data.ncon == is_explicit
+    said = [change for change in scene.changes if "overlap by 10 mm" in change]
+    assert len(said) == 1
+    assert ("on → off" in said[0]) != is_explicit
+    assert ("eased out" in said[0]) == is_explicit
+
+
+LOADED = """<mujoco><option gravity="0 0 -10"/><worldbody>
+  <body name="tool" pos=".5 0 1"><freejoint/><geom size=".04" mass="1"/><site name="grip"/></body>
+  <body name="arm" pos="0 0 1"><joint type="ball"/>
+    <geom type="capsule" size=".01" fromto="0 0 0 .5 0 0" mass="2" contype="0" conaffinity="0"/>
+    <site name="end" pos=".5 0 0"/>
+    </body>
+  <body name="weight" pos=".5 0 .7"><freejoint/><geom size=".02" mass=".5"/>
+    <site name="hook"/></body>
+  <body name="apart" pos="2 0 1"><freejoint/><geom size=".02" mass=".5"/></body></worldbody>
+  <tendon><spatial range="0 .3"><site site="grip"/><site site="hook"/></spatial></tendon>
+  <equality><weld site1="end" site2="grip"/></equality></mujoco>"""
+
+
+def test_parts_welded_to_the_tool_are_carried_with_it_and_loads_on_tendons_are_named(
+    tmp_path: Path,
+) -> None:
+    scene = load_scene(scene_file(tmp_path, LOADED))
+    scene.carry_tool("asked for")
+    assert (
+        "weight of the tool: felt → carried, but not that of 'weight' on its tendons (asked for)"
+        in (scene.changes)
+    )
+    bodies = "tool", "arm", "weight", "apart"
+    assert [float(scene.model.body_gravcomp[scene.model.body(name).id]) for name in bodies] == [
+        1.0,
+        1.0,
+        0.0,
+        0.0,
+    ]
+    mujoco.mj_step(scene.model, scene.data, 200)
+    # what is carried stays without a hand, but for the pull of the load
+    assert scene.data.body("apart").xpos[2] < 0.9
+    off = load_scene(scene_file(tmp_path, LOADED.replace('range="0 .3"', "")))
+    off.carry_tool("asked for")
+    mujoco.mj_step(off.model, off.data, 200)
+    assert off.data.site("grip").xpos == pytest.approx([0.5, 0, 1], abs=1e-6)
+
+
+def test_a_load_that_sinks_in_the_hand_is_named_with_its_energy(tmp_path: Path) -> None:
+    text = LOADED.replace('range="0 .3"', 'range="0 .31"').replace("<equality>", "<!--").replace(
+        "</equality>", "-->"
+    )  # fmt: skip
+    scene = load_scene(scene_file(tmp_path, text))
+    scene.carry_tool("asked for")
+    with hb.Bridge(
+        scene, "simulated", clock=hb.SimulatedClock(), recording=tmp_path / "run.mcap"
+    ) as bridge:
+        summary = bridge.run(duration=1.0)
+    released = summary.hand_energy.scene
+    # the weight of 5 N sinks with the hand, which the simulated springs of 135 N/m let down
+    assert released == pytest.approx(-summary.energies["coupling_work"], rel=0.01)
+    assert released > 0.04
+    words = f"gave the hand {1e3 * released:.3g} mJ, as weights that sink and springs do"
+    assert words in str(summary)
+    assert words in hb.audit(tmp_path / "run.mcap").reason

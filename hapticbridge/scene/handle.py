@@ -452,14 +452,53 @@ def take_over_mocap(
     return (SceneChange(f"grip held by mocap body '{name}'{more} → by the hand alone"),), []
 
 
+def tied_trees(model: mujoco.MjModel, tree: int) -> list[int]:
+    """Returns a kinematic tree and those that active welds and connects tie to it."""
+    pairs = [
+        {int(model.body_treeid[body]) for body in _tied_bodies(model, i)} - {-1}
+        for i in np.flatnonzero(model.eq_active0).tolist()
+    ]
+    found: set[int] = set()
+    more = {tree}
+    while more - found:
+        found |= more
+        more = set().union(*(pair for pair in pairs if pair & found))
+    return sorted(found)
+
+
+def hanging_loads(model: mujoco.MjModel, trees: Sequence[int]) -> list[str]:
+    """Returns the first bodies of other trees that springs or limits of tendons pull at some trees.
+
+    Args:
+        model: The compiled scene.
+        trees: Trees whose weight is carried.
+    """
+    found: dict[str, None] = {}
+    for tendon in range(model.ntendon):
+        pulls = model.tendon_limited[tendon] or np.any(model.tendon_stiffness[tendon])
+        wraps = np.arange(model.tendon_num[tendon]) + model.tendon_adr[tendon]
+        sites = wraps[model.wrap_type[wraps] == int(mujoco.mjtWrap.mjWRAP_SITE)]
+        bodies = model.site_bodyid[model.wrap_objid[sites]]
+        at = model.body_treeid[bodies]
+        if pulls and np.isin(at, trees).any():
+            loads = bodies[~np.isin(at, [*trees, -1])].tolist()
+            found |= {model.body(i).name or str(i): None for i in loads}
+    return list(found)
+
+
+def _tied_bodies(model: mujoco.MjModel, equality: int) -> tuple[int, ...]:
+    """Returns both bodies of a weld or connect; nothing for another equality constraint."""
+    if int(model.eq_type[equality]) not in _HOLDING:
+        return ()
+    sides = np.array([model.eq_obj1id[equality], model.eq_obj2id[equality]])
+    if model.eq_objtype[equality] == int(mujoco.mjtObj.mjOBJ_SITE):
+        sides = model.site_bodyid[sides]
+    return tuple(sides.tolist())
+
+
 def _mocap_of(model: mujoco.MjModel, equality: int) -> str:
     """Returns the mocap body, or its number, that a weld or connect ties to; empty without one."""
-    if int(model.eq_type[equality]) not in _HOLDING:
-        return ""
-    sides = model.eq_obj1id[equality], model.eq_obj2id[equality]
-    if model.eq_objtype[equality] == int(mujoco.mjtObj.mjOBJ_SITE):
-        sides = tuple(model.site_bodyid[list(sides)])
-    roots = (int(model.body_rootid[body]) for body in sides)
+    roots = (int(model.body_rootid[body]) for body in _tied_bodies(model, equality))
     names = (model.body(i).name or str(i) for i in roots if model.body_mocapid[i] >= 0)
     return str(next(names, ""))
 
@@ -499,7 +538,8 @@ def exclude_nested(
     """Excludes contacts between parts of a robot that begin inside each other, for good.
 
     A link whose hull encloses part of the link that carries it is inside it in every pose. A
-    contact between them would only jam the joint.
+    contact between them would only jam the joint. An explicit ``<pair>`` stays: MuJoCo does not
+    exclude it.
 
     Args:
         spec: The scene with its handle; changed in place.
@@ -514,7 +554,7 @@ def exclude_nested(
     go_to_start(model, data, grip)
     pairs: dict[tuple[int, int], Overlap] = {}
     for overlap in overlaps(model, data, NOTABLE_OVERLAP):
-        if is_nested(model, *overlap.bodies):
+        if is_nested(model, *overlap.bodies) and not overlap.is_explicit:
             pairs.setdefault(overlap.bodies, overlap)
     bodies = list(spec.bodies)
     if len(bodies) != model.nbody or not pairs:
