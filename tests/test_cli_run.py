@@ -181,7 +181,8 @@ def test_trip_is_told_with_what_to_do_about_it(call: Called, tmp_path: Path) -> 
 
 
 LADEN = """<mujoco><option timestep="0.001"/><worldbody>
-<body name="tray"><freejoint/><geom type="box" size=".1 .1 .01" mass=".5"/><site name="grip"/></body>
+<body name="tray"><freejoint/><geom type="box" size=".1 .1 .01" mass=".5"/>
+<site name="grip"/></body>
 <body name="brick" pos="0 0 .03"><freejoint/><geom type="box" size=".05 .05 .02" mass=".5"/></body>
 </worldbody></mujoco>"""
 
