@@ -198,7 +198,7 @@ RICH = """<mujoco model="rich">
   <tendon><spatial name="cord" stiffness="3"><site site="hook"/><site site="latch"/></spatial>
   <fixed name="mix"><joint joint="rail" coef="2"/></fixed></tendon>
   <equality><connect name="chain" body1="cart" body2="gate" anchor="0 0 0" active="false"/>
-    <joint name="gear" joint1="rail" joint2="hinge" polycoef="0 .1 0 0 0"/></equality>
+    <joint name="gear" joint1="rail" joint2="hinge" polycoef="0 2 0 0 0"/></equality>
   <actuator><position class="servo" name="drive" joint="rail"/><motor name="torque" joint="hinge"/>
     <general name="winch" tendon="cord" dyntype="filter" dynprm=".1"/></actuator>
   <sensor><jointpos name="where" joint="rail"/><force name="push" site="hook"/>

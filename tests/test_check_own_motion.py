@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cli_cases import Called
+from outside_scenes import scene_file
 
 from hapticbridge.check.case import open_case
 from hapticbridge.check.findings import own_motion_faults
@@ -149,3 +150,26 @@ def test_energy_that_fast_joints_create_beside_contacts_of_the_scene_is_told(
     assert found.created > NOTABLE_ENERGY
     assert "--contact rigid takes it back" in found.creation
     assert not moved(source).creation
+
+
+def test_own_motion_starts_where_the_bridge_starts_and_without_the_mocap_body_it_replaces(
+    tmp_path: Path,
+) -> None:
+    """The arm would hang on its mocap body for ever, and the lever would be pushed out."""
+    text = """<mujoco><option timestep=".001"/><worldbody>
+      <body name="m" mocap="true" pos=".2 0 .5"/>
+      <body name="arm" pos="0 0 .5"><joint axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 .2 0 0" size=".01"/>
+        <site name="grip" pos=".2 0 0"/></body>
+      <body name="lever" pos="0 1 .5"><joint axis="0 0 1" range="90 120"/>
+        <geom type="capsule" fromto="0 0 0 .2 0 0" size=".01"/></body></worldbody>
+      <equality><connect body1="m" body2="arm" anchor="0 0 0"/></equality></mujoco>"""
+    source = read_scene(scene_file(tmp_path, text))
+    scene = compile_scene(source)
+    assert [change.words for change in scene.differences[1:]] == [
+        "grip held by mocap body 'm' → by the hand alone",
+        "start of joint '1': 0 deg → 90 deg, its limit",
+    ]
+    found = own_motion(source, scene, RunPoint(NO_HAND, PERIOD))
+    assert found is not None
+    assert found.jnd < 1.0

@@ -279,7 +279,7 @@ RUNAWAY = """<mujoco><option timestep="0.001" gravity="0 0 0"/><worldbody>
         (
             'site="grip" gear="1 0 0 0 0 0"',
             50,
-            "more than it put in, by more than the energy limit",
+            "more than it put in and the scene released, by more than the energy limit",
         ),
     ],
 )

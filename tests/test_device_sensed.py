@@ -109,7 +109,10 @@ def test_what_turning_pays_the_hand_is_bounded_by_the_energy_limit(tmp_path: Pat
     wrist = Wrist()
     with (
         hb.Bridge(plate(tmp_path), wrist, clock=hb.SimulatedClock()) as bridge,
-        pytest.raises(SafetyTrip, match="more than it put in, by more than the energy limit"),
+        pytest.raises(
+            SafetyTrip,
+            match="more than it put in and the scene released, by more than the energy limit",
+        ),
     ):
         bridge.run(60.0)
     # beyond what the device's own damping burns, in J

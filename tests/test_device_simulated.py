@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
+import hapticbridge as hb
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import Hand, Motion, SimulatedDevice
+from hapticbridge.device import Hand, Motion, SimulatedDevice, device_for
 from hapticbridge.device.trajectory import lissajous
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.record import SAMPLE_DTYPE
+from hapticbridge.scene import load_scene
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
 Array = NDArray[np.float64]
@@ -484,3 +486,35 @@ def test_a_device_is_displaced_only_between_start_and_first_sample() -> None:
     assert sample[0]["quaternion"] == pytest.approx([np.cos(0.05), 0, 0, np.sin(0.05)], abs=1e-15)
     with pytest.raises(DeviceError, match="before its first sample"):
         device.displace(knock)
+
+
+@pytest.mark.parametrize(("mass", "stiffness"), [(0.1, 135.0), (0.35, 686.7), (3.0, 135.0)])
+def test_hand_is_firm_enough_to_lift_the_tool(
+    tmp_path: Path, mass: float, stiffness: float
+) -> None:
+    """By the weight over a sag of 5 mm; a light tool needs no more, and 29 N are carried."""
+    path = tmp_path / "mug.xml"
+    path.write_text(
+        f"""<mujoco><option gravity="0 0 -9.81"/><worldbody><geom type="plane" size="1 1 1"/>
+        <body name="mug" pos="0 0 .05"><freejoint/>
+        <geom type="cylinder" size=".04 .05" mass="{mass}"/><site name="grip"/></body>
+        </worldbody></mujoco>"""
+    )
+    said: list[str] = []
+    device = device_for(load_scene(path), "simulated", said.append)
+    assert isinstance(device, SimulatedDevice)
+    assert isinstance(device.hand, Hand)
+    assert device.hand.stiffness == pytest.approx(stiffness)
+    assert bool(said) == (stiffness > 135.0)
+    if not said:
+        return
+    lifted = []
+    for spec in ("simulated", "simulated:hand_stiffness=135,hand_damping=6.5"):
+        scene = load_scene(path)
+        with hb.Bridge(scene, spec, clock=hb.SimulatedClock()) as bridge:
+            highest = 0.0
+            for _ in range(8):
+                bridge.run(duration=0.5)
+                highest = max(highest, float(scene.data.body("mug").xpos[2]) - 0.05)
+        lifted.append(highest > 1e-3)
+    assert lifted == [True, False]

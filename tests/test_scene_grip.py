@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import pytest
 from cli_cases import Called
 from outside_scenes import mjcf, refusal, refusal_of, scene_file
@@ -104,3 +105,40 @@ def test_a_site_whose_name_begins_as_a_joint_is_no_grip(tmp_path: Path) -> None:
     path = scene_file(tmp_path, arm('<site name="joint:tip"/>'))
     assert "joint:tip" not in [each.name for each in grips(mujoco.MjModel.from_xml_path(str(path)))]
     assert "no hinge or slide 'tip' to hold" in refusal(path, "joint:tip")
+
+
+DIALS = {
+    "a dial on its axis": (
+        "<body name='dial'><joint axis='0 0 1' damping='1e-4'/>"
+        "<geom type='cylinder' size='.04 .01' mass='.1'/></body>",
+        ["dial@0.04,0,0", "dial"],
+    ),
+    "a valve in a turned frame, without a name": (
+        "<body euler='0 90 0'><body euler='30 0 0'><joint axis='0 1 0' damping='1e-4'/>"
+        "<geom type='box' size='.1 .01 .01' mass='.1'/></body></body>",
+        ["2@0.1,0,0", "2"],
+    ),
+    "a knob on a ball joint": (
+        "<body name='knob'><joint type='ball' damping='1e-4'/><geom size='.02' mass='.1'/></body>",
+        ["knob@0.02,0,0", "knob"],
+    ),
+    "a body off its axis": (
+        "<body name='door'><joint axis='0 0 1'/><geom size='.01' pos='.1 0 0'/></body>",
+        ["door"],
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", DIALS)
+def test_a_body_that_turns_about_its_centre_is_offered_by_its_rim(
+    tmp_path: Path, kind: str
+) -> None:
+    body, expected = DIALS[kind]
+    path = scene_file(tmp_path, mjcf("<option gravity='0 0 0'/>", body=body))
+    assert [each.name for each in grips(mujoco.MjModel.from_xml_path(str(path)))] == expected
+    scene = hb.load_scene(path, expected[0])
+    with hb.Bridge(scene, "simulated", clock=hb.SimulatedClock()) as bridge:
+        bridge.run(duration=1.0)
+    # a hand of three axes turns it
+    _, *turned = scene.data.qpos if kind == "a knob on a ball joint" else (1.0, *scene.data.qpos)
+    assert np.abs(turned).max() > 1e-3

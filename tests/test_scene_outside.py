@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
 from hapticbridge.scene.rehearsal import holding_force, loaded_handle, static_load
+from hapticbridge.scene.start import Start
 
 Array = NDArray[np.float64]
 Stops = list[tuple[float, tuple[float, float, float]]]
@@ -212,6 +213,12 @@ BEYOND_ITS_LIMIT = """<mujoco>
 """A lever that starts 30 degrees beyond a limit, with MuJoCo's default options."""
 
 
+def leave_start(patch: pytest.MonkeyPatch) -> None:
+    """Leaves starts as they are in the files, violated constraints included."""
+    name = "hapticbridge.scene.load.start_on_constraints"
+    patch.setattr(name, lambda model, is_moved: Start(None, (), ()))
+
+
 def started(folder: Path, text: str, **options: Any) -> hb.Bridge:
     scene = hb.load_scene(scene_file(folder, text), as_is=options.pop("as_is", False))
     device = options.pop("device", "simulated")
@@ -219,7 +226,10 @@ def started(folder: Path, text: str, **options: Any) -> hb.Bridge:
     return hb.Bridge(scene, device, clock=hb.SimulatedClock(), **options)
 
 
-def test_start_beyond_a_limit_pushes_nothing_with_rigid_limits_alone(tmp_path: Path) -> None:
+def test_start_beyond_a_limit_pushes_nothing_with_rigid_limits_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave_start(monkeypatch)
     with started(tmp_path, BEYOND_ITS_LIMIT) as bridge:
         offset = np.subtract(bridge.session.parameters.handle_origin, bridge.scene.grip_pose())
         bridge.run(duration=0.5)
@@ -444,8 +454,9 @@ _STRETCHED = {
 @pytest.mark.parametrize("kind", _STRETCHED)
 @pytest.mark.parametrize("solref", ["0.02 1", "-20000 -50"])
 def test_error_at_the_start_creates_no_energy_with_rigid_constraints_alone(
-    tmp_path: Path, kind: str, solref: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, solref: str
 ) -> None:
+    leave_start(monkeypatch)
     body, constraint = _STRETCHED[kind]
     constraint = constraint.format(f'solref="{solref}"', f'solreflimit="{solref}"')
     text = f'<mujoco><option gravity="0 0 0"/><worldbody>{body}</worldbody>{constraint}</mujoco>'
@@ -453,10 +464,13 @@ def test_error_at_the_start_creates_no_energy_with_rigid_constraints_alone(
         assert bridge.run(duration=0.5).environment == "strict"
     assert hb.audit(tmp_path / "run.mcap").resimulation == "bit for bit"
     # MuJoCo's own constraint pulls the error together, which no port pays
-    with started(tmp_path, text, contact="scene", recording=None) as bridge:
-        with suppress(hb.SafetyTrip):
-            bridge.run(duration=0.5)
-        assert bridge.ledger.first_active is not None
+    for is_open in (True, False):
+        with started(tmp_path, text, contact="scene", recording=None) as bridge:
+            with suppress(hb.SafetyTrip):
+                bridge.run(duration=0.5)
+            pulled = bridge.ledger.first_active is not None
+        assert pulled == is_open
+        monkeypatch.undo()  # a start on its constraints has no error
 
 
 def test_body_welded_to_a_moved_mocap_body_follows_and_its_mover_pays(tmp_path: Path) -> None:

@@ -481,6 +481,8 @@ def _hand_words(report: AuditReport) -> str:
         at = f" at {grip!r}" if grip else ""
         if energy.net > INSTANT:
             found.append(f"net to the hand{at} {energy.sentence}")
+        elif energy.release:
+            found.append(f"the scene's storage{at} {energy.release}")
         if energy.blur:
             found.append(f"encoder steps{at} {energy.blur}")
     return "; ".join(found)

@@ -243,6 +243,12 @@ def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]
             f"at rest the hand bears {format_si(in_hand, 'N')}, {sag} beside the handle, most of "
             "it from motors, springs or parts of the scene that push the tool"
         )
+    elif setup.scene.is_carried:
+        yield (
+            f"at rest the hand bears {format_si(in_hand, 'N')}, {sag} beside the handle, from what "
+            'hangs or lies on the tool, whose weight is carried; gravcomp="1" in these bodies '
+            "carries them"
+        )
     elif 10.0 * float(np.linalg.norm(others)) > load:
         yield (
             f"at rest the hand bears {format_si(in_hand, 'N')}, {sag} beside the handle, most of "

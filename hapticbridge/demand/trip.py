@@ -48,7 +48,10 @@ _WORDS = {
     TripCode.BACKWARDS: "time ran backwards",
     TripCode.STRETCHED: "the tool is farther from the handle than the stretch limit",
     TripCode.TWISTED: "the tool is turned from the handle by more than the angle limit",
-    TripCode.GAVE_ENERGY: ("the hand would get more than it put in, by more than the energy limit"),
+    TripCode.GAVE_ENERGY: (
+        "the hand would get more than it put in and the scene released, by more than the energy "
+        "limit"
+    ),
     TripCode.CONTACTS_FULL: codes.WARNINGS[codes.CONTACTS_FULL],
     TripCode.CONSTRAINTS_FULL: codes.WARNINGS[codes.CONSTRAINTS_FULL],
     TripCode.DIVERGED: (

@@ -27,7 +27,12 @@ from typing import Any
 from hapticbridge.device.base import Device, DeviceInfo, calling_on_error, checked_close, telling
 from hapticbridge.device.driver import Driver, FoundDevice, Notify, Options, ignore_message
 from hapticbridge.device.profile import modelled, profile_named, profile_of
-from hapticbridge.device.simulated.device import GrippingDevice, SimulatedDevice, scene_hand
+from hapticbridge.device.simulated.device import (
+    GrippingDevice,
+    SimulatedDevice,
+    hand_for,
+    scene_hand,
+)
 from hapticbridge.device.simulated.dynamics import Hand
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice, read_motion
 from hapticbridge.errors import DeviceError, choices, nearest
@@ -300,7 +305,7 @@ def device_for(
 ) -> Device:
     """Opens a device for a scene; a simulated device takes its hand and its path from the scene.
 
-    The hand is the scene's (``scene_hand``) and follows ``NAME.csv`` beside the scene, if present;
+    The hand is the scene's (``hand_for``) and follows ``NAME.csv`` beside the scene, if present;
     one of several hands follows ``NAME_GRIP.csv``. Every option in the specification takes
     precedence over the scene. If its grip axis moves a joint, ``grip_axis``, a simulated device has
     one, whose fingers follow ``NAME_JOINT.csv``.
@@ -314,8 +319,13 @@ def device_for(
         return open_device(spec, notify=notify)
     options: dict[str, object] = {}
     if "hand" not in parsed(name, rest, _SIMULATED_OPTIONS):
-        hand = asdict(scene_hand(scene.model, scene.path))
-        options |= {_HAND_PREFIX + field: value for field, value in hand.items()}
+        hand, usual = hand_for(scene), scene_hand(scene.model, scene.path)
+        options |= {_HAND_PREFIX + field: value for field, value in asdict(hand).items()}
+        if hand != usual:
+            notify(
+                f"the simulated hand grips with {hand.stiffness:.3g} N/m instead of "
+                f"{usual.stiffness:g}, so that it lifts this tool"
+            )
     others = [each for each in scene.other_grips if each != str(Grip(grip_axis, "joint"))]
     grip = Grip.from_text(scene.grip).name
     path = scene.path.with_name(f"{scene.name}_{grip}.csv" if others else f"{scene.name}.csv")

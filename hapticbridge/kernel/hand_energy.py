@@ -11,6 +11,10 @@ INSTANT = 1e-3
 and a fortieth of the guard's usual energy limit. A smaller value fails runs for one late force; a
 larger one can be felt."""
 
+RELEASE = 0.04
+"""Energy in J from the scene's storage that a summary names: the guard's usual energy limit, which
+leaves this energy out. A tool of 1 kg that sinks by 4 mm gives as much."""
+
 _BOUND = (
     "only --energy-limit bounds what they give the hand, and what bodies lose beside the tool "
     "comes on top"
@@ -110,6 +114,16 @@ class HandEnergy:
         """Energy that no meter of stepped positions sees, as a clause; empty without steps."""
         return (
             f"may hide {format_energy(2.0 * self.hidden)} that the hand got" if self.hidden else ""
+        )
+
+    @property
+    def release(self) -> str:
+        """Clause on the energy from the scene's storage; empty below ``RELEASE``."""
+        if self.scene <= RELEASE:
+            return ""
+        return (
+            f"gave the hand {format_energy(self.scene)}, as weights that sink and springs do; the "
+            "energy limit leaves it out"
         )
 
     @property

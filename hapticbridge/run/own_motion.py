@@ -21,7 +21,7 @@ from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.scene import Scene, SceneSource, plain_model
-from hapticbridge.scene.compile import START_KEYFRAME
+from hapticbridge.scene.compile import reset
 from hapticbridge.units import format_si
 
 SECONDS = 0.5
@@ -137,7 +137,7 @@ def own_motion(source: SceneSource, scene: Scene, setting: RunPoint) -> OwnMotio
         1 mm for lengths of 10 to 20 mm between the fingers, 2.2 mm for 80 mm.
     """
     with quiet():
-        alone = _FileMotion.simulate(source)
+        alone = _FileMotion.simulate(source, scene)
         return None if alone is None else alone.against(scene, setting)
 
 
@@ -151,13 +151,17 @@ class _FileMotion:
     seconds: float
 
     @classmethod
-    def simulate(cls, source: SceneSource) -> Self | None:
-        """Moves the scene; returns None if it diverges."""
+    def simulate(cls, source: SceneSource, scene: Scene) -> Self | None:
+        """Moves the scene from the bridge's start; returns None if it diverges.
+
+        A mocap body that the hand replaces holds nothing here either.
+        """
         model = plain_model(source)
+        model.eq_active0[:] = scene.model.eq_active0[: model.neq]
         data = mujoco.MjData(model)
-        home = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME)
-        if home >= 0:
-            mujoco.mj_resetDataKeyframe(model, data, home)
+        reset(model, data)
+        scene.reset()
+        data.qpos[:] = scene.data.qpos
         mujoco.mj_forward(model, data)
         start, step = data.xipos.copy(), float(model.opt.timestep)
         most = MAX_WORK / max(model.nv + data.nefc, 1)
@@ -243,7 +247,7 @@ def own_substeps(
         SceneError: The scene does not compile.
     """
     with quiet():
-        alone = _FileMotion.simulate(source)
+        alone = _FileMotion.simulate(source, scene)
         if alone is None:
             return 1, None
         one = alone.against(scene, replace(setting, substeps=1))

@@ -373,6 +373,8 @@ class Summary:
         yield from energy_rows(self.energies, self.start_potential)
         if self.max_net_energy > INSTANT:
             yield "net to the hand", self.hand_energy.sentence
+        elif release := self.hand_energy.release:
+            yield "scene's storage", release
         if blur := self.hand_energy.blur:
             yield "encoder steps", blur
 

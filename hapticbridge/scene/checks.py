@@ -408,11 +408,13 @@ class Overlap:
         depth: Depth in m, > 0.
         words: Names of both sides.
         bodies: Ids of both bodies; -1 for a flex.
+        is_explicit: True for a ``<pair>`` of the file, which no exclusion of bodies switches off.
     """
 
     depth: float
     words: str
     bodies: tuple[int, int]
+    is_explicit: bool = False
 
     def __str__(self) -> str:
         return f"{self.words} overlap by {1e3 * self.depth:.3g} mm"
@@ -424,13 +426,16 @@ def overlaps(model: mujoco.MjModel, data: mujoco.MjData, depth: float) -> list[O
     ``data`` must be after MuJoCo's position stage. Each pair of geoms or flexes is listed once.
     """
     found: dict[str, Overlap] = {}
+    pairs = {frozenset(pair) for pair in zip(model.pair_geom1, model.pair_geom2, strict=True)}
     for contact in sorted(data.contact, key=lambda contact: float(contact.dist)):
         if contact.dist >= -depth:
             break
         sides = list(zip(contact.geom.tolist(), contact.flex.tolist(), strict=True))
         words = " and ".join(_side_name(model, geom, flex) for geom, flex in sides)
         first, second = (int(model.geom_bodyid[geom]) if geom >= 0 else -1 for geom, _ in sides)
-        found.setdefault(words, Overlap(-float(contact.dist), words, (first, second)))
+        is_explicit = frozenset(geom for geom, _ in sides) in pairs
+        overlap = Overlap(-float(contact.dist), words, (first, second), is_explicit)
+        found.setdefault(words, overlap)
     return list(found.values())
 
 

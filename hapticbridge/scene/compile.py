@@ -57,13 +57,22 @@ def handles(model: mujoco.MjModel, grip: str) -> tuple[tuple[int, int], ...]:
     return tuple(found)
 
 
-def go_to_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
-    """Resets the data to the start, with the handle at the grip, and calls ``mj_forward``."""
-    key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME)
-    if key >= 0:
+def find_start(model: mujoco.MjModel) -> int:
+    """Returns the id of the keyframe that a scene starts from, or -1."""
+    return int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME))
+
+
+def reset(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Resets the data to the start, without a computation."""
+    if (key := find_start(model)) >= 0:
         mujoco.mj_resetDataKeyframe(model, data, key)
     else:
         mujoco.mj_resetData(model, data)
+
+
+def go_to_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
+    """Resets the data to the start, with the handle at the grip, and calls ``mj_forward``."""
+    reset(model, data)
     # the model's own handle pose may be outdated if its start was changed after loading
     mujoco.mj_kinematics(model, data)
     for body_id, site_id in handles(model, grip):
@@ -116,7 +125,7 @@ def hold_servos(model: mujoco.MjModel) -> tuple[SceneChange, ...]:
     Returns:
         The change, as ``name: old → new``; nothing if no servo was to leave its pose.
     """
-    key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME)
+    key = find_start(model)
     if key < 0 or np.any(model.key_ctrl[key]) or np.any(model.key_act[key]):
         return ()
     data, moved = mujoco.MjData(model), []

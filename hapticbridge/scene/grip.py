@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.codes import Grip
-from hapticbridge.scene.compile import START_KEYFRAME, compiled
+from hapticbridge.scene.compile import compiled, reset
 from hapticbridge.scene.source import SourceFile
 
 MAX_OFFERED = 4
@@ -38,6 +38,11 @@ _HELD_MASS = 0.005, 5.0
 """Range in kg of what a hand holds without a support, for a point."""
 
 
+ON_AXIS = 1e-9
+"""Way of a centre of mass in m/rad below which it lies on the axes that turn it. Rounding leaves
+1e-17; a body farther off follows a hand that pulls it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Candidate:
     """Something in a scene that a hand could hold.
@@ -48,8 +53,8 @@ class Candidate:
         body: Name of the body, or its number if it has none.
         mass: Mass in kg of the body and of all that hangs on it.
         freedom: Directions and axes, 0 to 6, that its joints leave free at the start.
-        points: Plausibility, without unit: up to 3 for the name, 2 for freedom, 1 for a mass that a
-            hand holds, 0.5 for a site and 0.5 for depth in the tree.
+        points: Plausibility, without unit: up to 3 for the name, 2 for freedom, 1 for a way of the
+            point, 1 for a mass that a hand holds, 0.5 for a site and 0.5 for depth in the tree.
     """
 
     name: str
@@ -68,15 +73,14 @@ class Candidate:
 def grips(model: mujoco.MjModel) -> tuple[Candidate, ...]:
     """Returns all that a hand could hold, the most plausible first.
 
-    These are the named sites and the bodies that joints can move; mocap bodies are none of them.
+    These are the named sites and the bodies that joints can move; mocap bodies are none of them. A
+    body that turns about its centre of mass is offered at its rim too.
 
     Args:
         model: The scene without a handle.
     """
     data = mujoco.MjData(model)
-    key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME)
-    if key >= 0:
-        mujoco.mj_resetDataKeyframe(model, data, key)
+    reset(model, data)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     depths = np.zeros(model.nbody)
@@ -90,13 +94,14 @@ def grips(model: mujoco.MjModel) -> tuple[Candidate, ...]:
             continue  # the site of that name is the grip
         jacobian = np.zeros((6, model.nv))
         mujoco.mj_jac(model, data, jacobian[:3], jacobian[3:], point, body_id)
-        freedom = int(np.linalg.matrix_rank(jacobian)) if jacobian[:3].any() else 0
+        freedom = int(np.linalg.matrix_rank(jacobian))
         if not freedom:
             continue
         mass = float(model.body_subtreemass[body_id])
         points = (
             next((points for pattern, points in _LIKELY if pattern.search(name.lower())), 0.0)
             + freedom / 3
+            + bool(np.abs(jacobian[:3]).max() > ON_AXIS)
             + (_HELD_MASS[0] <= mass <= _HELD_MASS[1])
             + 0.5 * (kind == "site")
             + 0.5 * float(depths[body_id] / depths.max())
@@ -114,8 +119,36 @@ def _points(
         if name and not Grip.from_text(name).is_joint:
             yield "site", name, int(model.site_bodyid[site_id]), data.site_xpos[site_id]
     for body_id in range(1, model.nbody):
-        if model.body_weldid[body_id] != 0:
-            yield "body", model.body(body_id).name or str(body_id), body_id, data.xipos[body_id]
+        if model.body_weldid[body_id] == 0:
+            continue
+        name, jacobian = model.body(body_id).name or str(body_id), np.zeros((3, model.nv))
+        yield "body", name, body_id, data.xipos[body_id]
+        mujoco.mj_jacBodyCom(model, data, jacobian, None, body_id)
+        if (
+            np.abs(jacobian).max(initial=0.0) < ON_AXIS
+            and (rim := _rim(model, body_id)) is not None
+        ):
+            text = ",".join(f"{value:.3g}" for value in rim)
+            matrix = data.xmat[body_id].reshape(3, 3)
+            yield "body", f"{name}@{text}", body_id, data.xpos[body_id] + matrix @ rim
+
+
+def _rim(model: mujoco.MjModel, body_id: int) -> NDArray[np.float64] | None:
+    """Returns the point in m, in a body's frame, by which a dial or valve on an axis is turned.
+
+    It is as far from the axis of the body's first joint as its largest geom reaches, across it.
+    """
+    geoms = np.flatnonzero(model.geom_bodyid == body_id)
+    if not len(geoms) or not model.body_jntnum[body_id]:
+        return None
+    largest = geoms[np.argmax(model.geom_rbound[geoms])]
+    axis = model.jnt_axis[model.body_jntadr[body_id]]
+    across, matrix = np.eye(3)[np.argmin(np.abs(axis))], np.zeros(9)
+    across = across - axis * (axis @ across)
+    across /= np.linalg.norm(across)
+    mujoco.mju_quat2Mat(matrix, model.geom_quat[largest])
+    reach = np.abs(matrix.reshape(3, 3).T @ across) @ model.geom_aabb[largest, 3:]
+    return np.asarray(model.body_ipos[body_id] + reach * across) if reach > 0.0 else None
 
 
 def add_grip(spec: mujoco.MjSpec, grip: str, sources: tuple[SourceFile, ...]) -> list[str]:

@@ -27,6 +27,7 @@ from hapticbridge.kernel.codes import (
     Grip,
     added_actuators,
     held_body,
+    held_joint,
     name_of_hand,
 )
 from hapticbridge.scene.checks import (
@@ -393,13 +394,152 @@ def limit_motors_alone(
     return (SceneChange(words),)
 
 
+HELD = 1e-6
+"""Way of a grip in a motion of unit size, in m, below which constraints hold it. Rounding leaves
+1e-12 of way; a softer hinge of the tool moves by its lever, of a mm or more."""
+
+_HOLDING = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
+
+
+def take_over_mocap(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, grip: str, *, as_is: bool = False
+) -> tuple[tuple[SceneChange, ...], list[str]]:
+    """Switches off the constraints by which mocap bodies of the scene hold the grip in place.
+
+    Scenes made for teleoperation move their tool by a weld to a mocap body. The hand replaces this
+    body, and the coupling replaces the weld. Where the grip can still move along two
+    axes, such as a finger of a held palm, the constraint stays.
+
+    Args:
+        spec: The scene with its handle; changed in place.
+        model: The model that it compiles to; changed in place.
+        grip: Grip of one hand.
+        as_is: If true, such a scene is refused.
+
+    Returns:
+        The change, as ``name: old → new``, and clauses on constraints that leave the grip a part of
+        its motion.
+
+    Raises:
+        SceneError: A change is needed that ``as_is`` forbids.
+    """
+    held = [i for i in np.flatnonzero(model.eq_active0).tolist() if _mocap_of(model, i)]
+    if not held:
+        return (), []
+    data = mujoco.MjData(model)
+    go_to_start(model, data, grip)
+    free, kept = (_motions(model, data, grip, without) for without in (held, []))
+    is_held = _rank(kept[:3]) < min(2, _rank(free[:3]))
+    for i in held.copy():  # the fewest that must go
+        others = [j for j in held if j != i]
+        if _rank(_motions(model, data, grip, others)) == _rank(free):
+            held = others
+    if not held:
+        return (), []
+    more = f" and {len(held) - 1} more" if len(held) > 1 else ""
+    name, lines = _mocap_of(model, held[0]), 'active="false" at its weld or connect'
+    if not is_held:
+        part = f"{_rank(kept)} of {_rank(free)} of its motions; to let it go write {lines}"
+        return (), [f"mocap body '{name}'{more} holds the tool and leaves the grip {part}"]
+    if as_is:
+        raise SceneError(
+            f"grip '{grip}' is held in place by mocap body '{name}'{more}; write {lines}, or let "
+            "the hand replace that body (without --as-is)"
+        )
+    for i in held:
+        model.eq_active0[i] = 0
+        next(equality for equality in spec.equalities if equality.id == i).active = False
+    return (SceneChange(f"grip held by mocap body '{name}'{more} → by the hand alone"),), []
+
+
+def tied_trees(model: mujoco.MjModel, tree: int) -> list[int]:
+    """Returns a kinematic tree and those that active welds and connects tie to it."""
+    pairs = [
+        {int(model.body_treeid[body]) for body in _tied_bodies(model, i)} - {-1}
+        for i in np.flatnonzero(model.eq_active0).tolist()
+    ]
+    found: set[int] = set()
+    more = {tree}
+    while more - found:
+        found |= more
+        more = set().union(*(pair for pair in pairs if pair & found))
+    return sorted(found)
+
+
+def hanging_loads(model: mujoco.MjModel, trees: Sequence[int]) -> list[str]:
+    """Returns the first bodies of other trees that springs or limits of tendons pull at some trees.
+
+    Args:
+        model: The compiled scene.
+        trees: Trees whose weight is carried.
+    """
+    found: dict[str, None] = {}
+    for tendon in range(model.ntendon):
+        pulls = model.tendon_limited[tendon] or np.any(model.tendon_stiffness[tendon])
+        wraps = np.arange(model.tendon_num[tendon]) + model.tendon_adr[tendon]
+        sites = wraps[model.wrap_type[wraps] == int(mujoco.mjtWrap.mjWRAP_SITE)]
+        bodies = model.site_bodyid[model.wrap_objid[sites]]
+        at = model.body_treeid[bodies]
+        if pulls and np.isin(at, trees).any():
+            loads = bodies[~np.isin(at, [*trees, -1])].tolist()
+            found |= {model.body(i).name or str(i): None for i in loads}
+    return list(found)
+
+
+def _tied_bodies(model: mujoco.MjModel, equality: int) -> tuple[int, ...]:
+    """Returns both bodies of a weld or connect; nothing for another equality constraint."""
+    if int(model.eq_type[equality]) not in _HOLDING:
+        return ()
+    sides = np.array([model.eq_obj1id[equality], model.eq_obj2id[equality]])
+    if model.eq_objtype[equality] == int(mujoco.mjtObj.mjOBJ_SITE):
+        sides = model.site_bodyid[sides]
+    return tuple(sides.tolist())
+
+
+def _mocap_of(model: mujoco.MjModel, equality: int) -> str:
+    """Returns the mocap body, or its number, that a weld or connect ties to; empty without one."""
+    roots = (int(model.body_rootid[body]) for body in _tied_bodies(model, equality))
+    names = (model.body(i).name or str(i) for i in roots if model.body_mocapid[i] >= 0)
+    return str(next(names, ""))
+
+
+def _motions(
+    model: mujoco.MjModel, data: mujoco.MjData, grip: str, without: list[int]
+) -> NDArray[np.float64]:
+    """Returns a grip's small motions (6, n) that equality constraints allow, some left out."""
+    left_out = [*without, *np.flatnonzero(model.eq_type > int(mujoco.mjtEq.mjEQ_TENDON))]
+    is_row = data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+    is_row &= ~np.isin(data.efc_id, left_out)
+    rows = data.efc_J
+    if mujoco.mj_isSparse(model):
+        rows = np.zeros((data.nefc, model.nv))
+        mujoco.mju_sparse2dense(
+            rows, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
+        )
+    _, sizes, axes = np.linalg.svd(rows.reshape(data.nefc, model.nv)[is_row])
+    count = np.count_nonzero(sizes > HELD * sizes.max(initial=0.0))
+    jacobian = np.zeros((6, model.nv))
+    if (joint := held_joint(model, grip)) >= 0:
+        jacobian[0, model.jnt_dofadr[joint]] = 1.0
+    else:
+        mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], model.site(grip).id)
+    motions = jacobian @ axes[count:].T
+    motions[np.abs(motions) < HELD] = 0.0
+    return np.asarray(motions)
+
+
+def _rank(motions: NDArray[np.float64]) -> int:
+    return int(np.linalg.matrix_rank(motions, tol=HELD)) if motions.size else 0
+
+
 def exclude_nested(
     spec: mujoco.MjSpec, model: mujoco.MjModel, grip: str
 ) -> tuple[SceneChange, ...]:
     """Excludes contacts between parts of a robot that begin inside each other, for good.
 
     A link whose hull encloses part of the link that carries it is inside it in every pose. A
-    contact between them would only jam the joint.
+    contact between them would only jam the joint. An explicit ``<pair>`` stays: MuJoCo does not
+    exclude it.
 
     Args:
         spec: The scene with its handle; changed in place.
@@ -414,7 +554,7 @@ def exclude_nested(
     go_to_start(model, data, grip)
     pairs: dict[tuple[int, int], Overlap] = {}
     for overlap in overlaps(model, data, NOTABLE_OVERLAP):
-        if is_nested(model, *overlap.bodies):
+        if is_nested(model, *overlap.bodies) and not overlap.is_explicit:
             pairs.setdefault(overlap.bodies, overlap)
     bodies = list(spec.bodies)
     if len(bodies) != model.nbody or not pairs:

@@ -21,7 +21,15 @@ from hapticbridge.scene.checks import (
     check_start,
     refuse_overlap,
 )
-from hapticbridge.scene.compile import SceneChange, clause, compiled, hold_servos, seat_handle
+from hapticbridge.scene.compile import (
+    START_KEYFRAME,
+    SceneChange,
+    clause,
+    compiled,
+    find_start,
+    hold_servos,
+    seat_handle,
+)
 from hapticbridge.scene.grip import add_grip
 from hapticbridge.scene.handle import (
     announce_overlaps,
@@ -29,10 +37,12 @@ from hapticbridge.scene.handle import (
     exclude_nested,
     limit_motors_alone,
     set_options,
+    take_over_mocap,
 )
 from hapticbridge.scene.parameters import apply_parameters
 from hapticbridge.scene.scene import Scene
 from hapticbridge.scene.source import SourceFile, collect_sources
+from hapticbridge.scene.start import start_on_constraints
 from hapticbridge.units import format_si
 
 # Shipped scenes, by name
@@ -288,9 +298,12 @@ def compile_scene(
         concerns = [*source.concerns, *about_grip]
         for each in dict.fromkeys(grips):
             concerns += check_model(model, each)
+        for each in dict.fromkeys(grips):
+            replaced, holding = take_over_mocap(spec, model, each, as_is=as_is)
+            changes, concerns = changes + replaced, [*concerns, *holding]
+        model, started, remaining = _start_set(spec, model, source, as_is=as_is)
+        changes, concerns = changes + started, [*concerns, *remaining]
         seat_handle(model, grips[0])
-        if not as_is:
-            changes += hold_servos(model)
         data, values = mujoco.MjData(model), dict(source.parameters)
         scene = Scene(
             path, grips[0], model, data, source.sources, values, changes, as_is, _spec=spec
@@ -309,6 +322,23 @@ def compile_scene(
         for concern in concerns:
             warnings.warn(SceneWarning(path, concern), stacklevel=stacklevel)
     return scene
+
+
+def _start_set(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, source: SceneSource, *, as_is: bool
+) -> tuple[mujoco.MjModel, tuple[SceneChange, ...], tuple[str, ...]]:
+    """Puts the start on the constraints, in keyframe ``home``; returns changes and concerns.
+
+    A scene without this keyframe gets one if its start is moved.
+    """
+    start, has_keyframe = start_on_constraints(model, is_moved=not as_is), find_start(model) >= 0
+    if start.positions is not None:
+        if not has_keyframe:
+            spec.add_key(name=START_KEYFRAME)
+            model = compiled(spec, source.sources)
+        model.key_qpos[find_start(model)] = start.positions
+    held = hold_servos(model) if has_keyframe and not as_is else ()
+    return model, start.changes + held, start.remaining
 
 
 @contextmanager

@@ -102,6 +102,24 @@ def site_inertia(model: mujoco.MjModel, data: mujoco.MjData, site: int) -> float
     return _inertia_along(model, data, jacobian)
 
 
+def site_weight(model: mujoco.MjModel, data: mujoco.MjData, site: int) -> float:
+    """Returns the force in N that holds a site against weight, springs and motors at rest.
+
+        f = (J M⁻¹ Jᵀ)⁺ J a
+
+    with the acceleration a that the scene has without constraints, so that what a table bears
+    counts. ``data`` must be current (``mj_forward``). A door on an upright hinge has none.
+    """
+    if model.nv == 0:
+        return 0.0
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jacSite(model, data, jacobian, None, site)
+    answer = np.zeros_like(jacobian)
+    mujoco.mj_solveM(model, data, answer, jacobian)
+    inertia = np.linalg.pinv(jacobian @ answer.T, rcond=1e-6, hermitian=True)
+    return float(np.linalg.norm(inertia @ jacobian @ data.qacc_smooth))
+
+
 def _inertia_along(
     model: mujoco.MjModel, data: mujoco.MjData, jacobian: NDArray[np.float64]
 ) -> float:

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import SceneError
+from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.codes import (
     HANDLE,
     WARNINGS,
@@ -26,7 +26,13 @@ from hapticbridge.kernel.pose import IDENTITY_POSE
 from hapticbridge.kernel.rigid_contact import IMPRATIO, MARGIN, MAX_MARGIN, largest_margin
 from hapticbridge.scene.compile import SceneChange, clause, compiled, go_to_start
 from hapticbridge.scene.contacts import announce_soft_equalities
-from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
+from hapticbridge.scene.handle import (
+    add_weld,
+    carry_over,
+    hanging_loads,
+    set_weld_gains,
+    tied_trees,
+)
 from hapticbridge.scene.source import SourceFile
 
 _MARGINS = ("geom_margin", "pair_margin", "flex_margin")
@@ -273,6 +279,7 @@ class Scene:
     def carry_tool(self, reason: str) -> None:
         """Compensates the weight of all that moves with the grip (MuJoCo's ``gravcomp``).
 
+        This is the tree of the grip's body, and what active welds and connects tie to it.
         ``model`` and ``data`` are replaced, and the change is noted with its reason. Inertia,
         contacts and motors stay. A carried weight stores no energy.
 
@@ -285,11 +292,13 @@ class Scene:
         self._spec.body(HANDLE).gravcomp = 1.0
         self._recompile(self._spec)
         model = self.model
-        for grip in (self.grip, *self.other_grips):
-            body_id = held_body(model, grip)
-            model.body_gravcomp[model.body_treeid == model.body_treeid[body_id]] = 1.0
-        self.is_carried = True
-        self.differences += (SceneChange("weight of the tool: felt → carried", reason=reason),)
+        held = {held_body(model, grip) for grip in (self.grip, *self.other_grips)}
+        trees = [tree for i in held for tree in tied_trees(model, int(model.body_treeid[i]))]
+        model.body_gravcomp[np.isin(model.body_treeid, trees)] = 1.0
+        self.is_carried, words = True, "weight of the tool: felt → carried"
+        if loads := hanging_loads(model, trees):
+            words += f", but not that of {choices(loads)} on its tendons"
+        self.differences += (SceneChange(words, reason=reason),)
         self.reset()
 
     def _recompile(self, spec: mujoco.MjSpec) -> None:

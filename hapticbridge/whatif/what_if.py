@@ -21,7 +21,7 @@ from hapticbridge.clock import Clock, SimulatedClock
 from hapticbridge.confinement import Work, Worker, in_bounds
 from hapticbridge.device import Device
 from hapticbridge.device.registry import FINGERS_HAND
-from hapticbridge.device.simulated.device import scene_hand
+from hapticbridge.device.simulated.device import hand_for
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import finite_or_null
 from hapticbridge.kernel.record import TickFlag
@@ -315,7 +315,7 @@ class _Experiment:
 
     def _closed(self, settings: Sequence[Settings]) -> WhatIfRun:
         def devices(scene: Scene) -> list[Device]:
-            hand = scene_hand(scene.model, scene.path)
+            hand = hand_for(scene)
             return [
                 IdentifiedDevice(run, FINGERS_HAND if run.parameters.is_joint else hand)
                 for run in self.hands

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -42,7 +43,8 @@ from hapticbridge.device.trajectory import Motion, read_motion
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
-from hapticbridge.scene import custom_numbers
+from hapticbridge.scene import Scene, custom_numbers
+from hapticbridge.scene.physics import site_weight
 from hapticbridge.theory.sampled_loop import WorstHand
 
 # Hand of a scene
@@ -82,6 +84,40 @@ def scene_hand(model: mujoco.MjModel, path: Path) -> Hand:
         return replace(DEFAULT_HAND, **dict(zip(_FIELDS, numbers, strict=False)))
     except DeviceError as error:
         raise SceneError(f"{where}; {error}") from None
+
+
+MAX_LIFT = 0.01
+"""Way in m that a hand's path leads a tool that does not follow: that of the slow Lissajous figure.
+A tool heavier than the default hand's spring pulls over it would never be lifted."""
+
+LIFT_SAG = 0.005
+"""Way in m by which a tool hangs below the path of a hand that fits its weight. Half of it makes
+the hand twice as stiff, beyond a firm human grip at 10 N."""
+
+
+def hand_for(scene: Scene) -> Hand:
+    """Returns the hand that follows a scene's path, which is firm enough to lift the tool.
+
+    It is ``scene_hand``. If the weight W of the tool is more than the default hand bears over
+    ``MAX_LIFT``, it is firmer,
+
+        k_h = W/s,    b_h = b_0 √(k_h/k_0)
+
+    with the sag s = ``LIFT_SAG`` and k_0, b_0 of ``DEFAULT_HAND``. A tool heavier than
+    ``USUAL_FORCE_LIMIT`` is carried by the bridge, and needs no firmer hand.
+
+    Raises:
+        SceneError: As for ``scene_hand``.
+    """
+    hand = scene_hand(scene.model, scene.path)
+    if custom_numbers(scene.model, SCENE_HAND) or scene.joint >= 0:
+        return hand
+    weight = site_weight(scene.model, scene.data, scene.model.site(scene.grip).id)
+    if not hand.stiffness * MAX_LIFT < weight <= USUAL_FORCE_LIMIT:
+        return hand
+    stiffness = weight / LIFT_SAG
+    damping = hand.damping * math.sqrt(stiffness / hand.stiffness)
+    return replace(hand, stiffness=stiffness, damping=damping)
 
 
 @cache

@@ -1,0 +1,239 @@
+"""Start of a scene on its own constraints: limits and equality constraints that hold in its pose.
+
+A file may start with an elbow beyond its limit, or with a weld whose parts are apart. Rigid
+constraints would hold that violation for the whole run, and soft ones would release its energy
+into the hand. The start is therefore moved onto the constraints before there is a force.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.scene.compile import SceneChange, reset
+
+VIOLATION = 1e-4
+"""Violation in m or rad above which a start is moved. Closed loops in published robots miss by
+some µm, which nothing shows. A larger value lets a run start with a constraint off by as much."""
+
+CLOSED = 1e-9
+"""Violation in m or rad at which a constraint counts as closed, so that no step follows."""
+
+MAX_STEPS = 100
+"""Number of steps of a projection. Closed loops take 5 to 20; those that cannot close take all."""
+
+MAX_NAMED = 4
+"""Number of joints and bodies that are named one by one. More are counted."""
+
+STIFF = 0.9999
+"""Impedance of the constraints in a step, without unit, MuJoCo's largest. Each step leaves about
+1 − d of a violation."""
+
+_ROWS = {
+    int(mujoco.mjtConstraint.mjCNSTR_EQUALITY): "equality",
+    int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT): "joint",
+    int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON): "tendon",
+}
+_KINDS = {
+    int(mujoco.mjtEq.mjEQ_CONNECT): "connect",
+    int(mujoco.mjtEq.mjEQ_WELD): "weld",
+    int(mujoco.mjtEq.mjEQ_JOINT): "joint equality",
+    int(mujoco.mjtEq.mjEQ_TENDON): "tendon equality",
+}
+_HINGES = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL)
+
+
+class Start(NamedTuple):
+    """Start of a scene on its constraints.
+
+    Attributes:
+        positions: Generalised positions (nq,), or None if no constraint is violated.
+        changes: Differences from the file's start.
+        remaining: Clauses on the constraints that stay violated.
+    """
+
+    positions: NDArray[np.float64] | None
+    changes: tuple[SceneChange, ...]
+    remaining: tuple[str, ...]
+
+
+def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Start:
+    """Projects the start of a compiled scene onto its limits and equality constraints.
+
+    Hinges and slides go to their limits alone. Each further step solves, by MuJoCo's own Newton
+    solver with stiff constraints at rest,
+
+        min ½ Δqᵀ M Δq    with    J Δq = −r for equalities,    J Δq >= −r for violated limits
+
+    with the inertia matrix M, the constraints' Jacobian J and their violation r. Weight, springs,
+    motors, dry friction and contacts give no force. Without them a scene's own soft constraints
+    come to rest at r = 0 too. An equality that cannot be closed is left out and described.
+
+    Args:
+        model: Compiled scene; it is not changed.
+        is_moved: If false, the violations are only described.
+    """
+    trial, data = _without_forces(model)
+    start, first = data.qpos.copy(), _violations(trial, data)
+    if max(first.values(), default=0.0) <= VIOLATION:
+        return Start(None, (), ())
+    end, last = (_projected(trial, data) if is_moved else start), first
+    if is_moved:
+        data.eq_active[:] = model.eq_active0
+        mujoco.mj_forward(trial, data)
+        last = _violations(trial, data)
+    still = {row: size for row, size in last.items() if size > VIOLATION}
+    remaining = [
+        f"{_row_name(model, row)} starts {_off(model, row, still[row])}, and stays so"
+        for row in still
+    ]
+    words = [
+        f"start of {_row_name(model, row)}: {_off(model, row, size)} → closed"
+        for row, size in first.items()
+        if size > VIOLATION and row not in still and row[0] != "joint"
+    ]
+    limited = {row[1] for row, size in first.items() if row[0] == "joint" and size > VIOLATION}
+    words += _moved(model, start, end, limited)
+    changes = tuple(map(SceneChange, _at_most(words, "parts of the scene")))
+    return Start(end if words else None, changes, _at_most(remaining, "constraints"))
+
+
+def _projected(trial: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
+    """Returns the positions on all constraints; without those equalities that cannot be closed."""
+    start = data.qpos.copy()
+    for _ in range(2):
+        data.qpos[:] = start
+        _clamp_joints(trial, data)
+        for _ in range(MAX_STEPS):
+            mujoco.mj_forward(trial, data)
+            sizes = _violations(trial, data)
+            if max(sizes.values(), default=0.0) <= CLOSED or not np.isfinite(data.qacc).all():
+                break
+            mujoco.mj_integratePos(trial, data.qpos, data.qacc, 1.0)
+        still = [row[1] for row, size in sizes.items() if row[0] == "equality" and size > VIOLATION]
+        if not still:
+            break
+        data.eq_active[still] = 0
+    if not np.isfinite(data.qpos).all():
+        data.qpos[:] = start
+    return np.array(data.qpos)
+
+
+def _clamp_joints(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Moves hinges and slides into their limits, without any other joint."""
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_LIMIT:
+        return
+    single = (model.jnt_limited != 0) & (model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))
+    places, (low, high) = model.jnt_qposadr[single], model.jnt_range[single].T
+    data.qpos[places] = np.clip(data.qpos[places], low, high)
+
+
+def _without_forces(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Returns a copy at its start in which stiff constraints give the only forces.
+
+    Its acceleration is the step Δq, as k = 1/s² asks for a = −r.
+    """
+    trial, disable = copy.copy(model), mujoco.mjtDisableBit
+    for flag in ("SPRING", "DAMPER", "GRAVITY", "ACTUATION", "FRICTIONLOSS", "CONTACT", "REFSAFE"):
+        trial.opt.disableflags |= int(getattr(disable, f"mjDSBL_{flag}"))
+    trial.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    trial.opt.gravity[:] = trial.opt.wind[:] = 0.0
+    trial.opt.tolerance, trial.opt.iterations = 0.0, 100
+    for name in ("eq_sol{}", "jnt_sol{}", "tendon_sol{}_lim"):
+        getattr(trial, name.format("ref"))[:] = -1.0, 0.0
+        getattr(trial, name.format("imp"))[:] = STIFF, STIFF, 1.0, 0.5, 2.0
+    trial.jnt_margin[:] = trial.tendon_margin[:] = 0.0
+    data = mujoco.MjData(trial)
+    reset(trial, data)
+    data.qvel[:] = 0.0
+    mujoco.mj_forward(trial, data)
+    return trial, data
+
+
+def _violations(model: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, int], float]:
+    """Returns the largest violation in m or rad of each limit and equality constraint."""
+    found: dict[tuple[str, int], float] = {}
+    for kind, number, distance in zip(data.efc_type, data.efc_id, data.efc_pos, strict=True):
+        row = _ROWS.get(int(kind), ""), int(number)
+        is_equality = row[0] == "equality"
+        if not row[0] or (is_equality and int(model.eq_type[number]) not in _KINDS):
+            continue
+        size = abs(float(distance)) if is_equality else max(-float(distance), 0.0)
+        found[row] = max(found.get(row, 0.0), size)
+    return found
+
+
+def _row_name(model: mujoco.MjModel, row: tuple[str, int]) -> str:
+    kind, number = row
+    if kind != "equality":
+        return f"{kind} '{getattr(model, kind)(number).name or number}'"
+    kind = _KINDS[int(model.eq_type[number])]
+    of = kind.removesuffix(" equality")
+    if of == kind:
+        is_site = int(model.eq_objtype[number]) == int(mujoco.mjtObj.mjOBJ_SITE)
+        of = "site" if is_site else "body"
+    held = (int(model.eq_obj1id[number]), int(model.eq_obj2id[number]))
+    sides = [
+        f"'{getattr(model, of)(i).name or i}'" for i in held if i > 0 or (i == 0 and of != "body")
+    ]
+    name = model.equality(number).name
+    return (f"{kind} '{name}'" if name else kind) + f" of {of} {' and '.join(sides)}"
+
+
+def _off(model: mujoco.MjModel, row: tuple[str, int], size: float) -> str:
+    kind, number = row
+    is_angle = kind == "joint" and int(model.jnt_type[number]) in _HINGES
+    if kind == "equality" and int(model.eq_type[number]) == int(mujoco.mjtEq.mjEQ_JOINT):
+        is_angle = int(model.jnt_type[model.eq_obj1id[number]]) in _HINGES
+    beyond = "off" if kind == "equality" else "beyond its limit"
+    return f"{_place(size, is_angle=is_angle)} {beyond}"
+
+
+def _place(value: float, *, is_angle: bool) -> str:
+    shown = float(f"{np.rad2deg(value) if is_angle else 1e3 * value:.3g}")
+    return f"{shown + 0.0:g} {'deg' if is_angle else 'mm'}"
+
+
+def _moved(
+    model: mujoco.MjModel,
+    start: NDArray[np.float64],
+    end: NDArray[np.float64],
+    limited: set[int],
+) -> list[str]:
+    """Returns the joints that start elsewhere, as ``start of joint 'elbow': 0 deg → 20 deg``."""
+    words, step = [], np.zeros(model.nv)
+    mujoco.mj_differentiatePos(model, step, 1.0, start, end)
+    for joint in range(model.njnt):
+        kind, first = int(model.jnt_type[joint]), int(model.jnt_dofadr[joint])
+        count = {0: 6, 1: 3}.get(kind, 1)
+        if np.abs(step[first : first + count]).max() <= VIOLATION:
+            continue
+        name = f"joint '{model.joint(joint).name or joint}'"
+        if count == 1:
+            before, after = (float(each[model.jnt_qposadr[joint]]) for each in (start, end))
+            is_angle = kind in _HINGES
+            change = f"{_place(before, is_angle=is_angle)} → {_place(after, is_angle=is_angle)}"
+        else:
+            way = step[first : first + count]
+            sizes = ((way[:3], False, "moved"), (way[3:], True, "turned"))
+            parts = sizes if count == 6 else ((way, True, "turned"),)
+            change = ", ".join(
+                f"{verb} by {_place(float(np.linalg.norm(part)), is_angle=is_angle)}"
+                for part, is_angle, verb in parts
+                if np.linalg.norm(part) > VIOLATION
+            )
+            if count == 6:
+                body = int(model.jnt_bodyid[joint])
+                name = f"body '{model.body(body).name or body}'"
+        words.append(f"start of {name}: {change}{', its limit' if joint in limited else ''}")
+    return words
+
+
+def _at_most(words: list[str], name: str) -> tuple[str, ...]:
+    """Returns the first of many sentences, and the number of the others."""
+    more = len(words) - MAX_NAMED
+    return (*words[:MAX_NAMED], *([f"start of {more} more {name}: as these"] if more > 0 else []))

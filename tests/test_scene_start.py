@@ -1,0 +1,283 @@
+"""Start of a scene: violated constraints, mocap bodies that hold the grip, carried loads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from outside_scenes import scene_file
+
+import hapticbridge as hb
+from hapticbridge.scene import load_scene
+from hapticbridge.scene.scene import Scene
+
+TOOL = """<body name="tool" pos=".5 0 .1"><freejoint/>
+  <geom type="box" size=".02 .02 .02" mass=".1"/><site name="grip"/></body>"""
+ARM = """<body name="{0}" pos="0 {1} .5" gravcomp="1">
+  <joint name="{0}" axis="0 1 0" damping=".01" {2}/>
+  <geom type="capsule" fromto="0 0 0 .2 0 0" size=".01" mass=".1"/></body>"""
+PART = '<body name="part" pos="0 0 .1"><freejoint/><geom size=".02" mass=".1"/></body>'
+DRIVEN = '<body name="{0}" pos="{1} 0 0"><joint name="{0}" type="slide"/><geom size=".02"/></body>'
+
+
+def scene_text(bodies: str, rest: str = "") -> str:
+    return f"<mujoco><worldbody>{TOOL}{bodies}</worldbody>{rest}</mujoco>"
+
+
+def started_said(scene: Scene) -> list[str]:
+    return [change for change in scene.changes if change.startswith("start of")]
+
+
+def error(scene: Scene) -> float:
+    """Largest violation of MuJoCo's own rows at the start."""
+    data = scene.data
+    is_equality = data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+    return float(np.where(is_equality, np.abs(data.efc_pos), -data.efc_pos).max(initial=0.0))
+
+
+BEYOND = scene_text(ARM.format("elbow", 0, 'range="20 90"'))
+GEARED = scene_text(
+    ARM.format("j1", 0, "") + ARM.format("j2", 0.5, ""),
+    '<equality><joint joint1="j1" joint2="j2" polycoef=".5 1 0 0 0"/></equality>',
+)
+WELDED = scene_text(
+    PART, '<equality><weld name="hold" body1="part" relpose="0 0 .05 1 0 0 0"/></equality>'
+)
+PINNED = scene_text(
+    PART, '<equality><connect body1="part" body2="tool" anchor="0 0 .2"/></equality>'
+    '<keyframe><key name="home" qpos=".5 0 .1 1 0 0 0 0 .1 .1 1 0 0 0"/></keyframe>',
+)  # fmt: skip
+CORDED = scene_text(
+    PART.replace("</body>", '<site name="b"/></body><site name="a" pos="0 0 .4"/>'),
+    '<tendon><spatial name="cord" range="0 .2"><site site="a"/><site site="b"/></spatial></tendon>',
+)
+
+CASES = {
+    BEYOND: ["start of joint 'elbow': 0 deg → 20 deg, its limit"],
+    GEARED: [
+        "start of joint equality of joint 'j1' and 'j2': 28.6 deg off → closed",
+        "start of joint 'j1': 0 deg → 14.3 deg",
+        "start of joint 'j2': 0 deg → -14.3 deg",
+    ],
+    WELDED: [
+        "start of weld 'hold' of body 'part': 150 mm off → closed",
+        "start of body 'part': moved by 150 mm",
+    ],
+    PINNED: [
+        "start of connect of body 'part' and 'tool': 100 mm off → closed",
+        "start of body 'tool': turned by 8.56 deg",
+        "start of body 'part': turned by 5.91 deg",
+    ],
+    CORDED: [
+        "start of tendon 'cord': 100 mm beyond its limit → closed",
+        "start of body 'part': moved by 100 mm",
+    ],
+}
+
+
+@pytest.mark.parametrize("text", CASES)
+def test_violated_constraint_is_closed_before_the_run_and_said(tmp_path: Path, text: str) -> None:
+    scene = load_scene(scene_file(tmp_path, text))
+    assert error(scene) < 1e-8
+    assert started_said(scene) == CASES[text]
+    # the file itself starts with the violation
+    with pytest.warns(UserWarning, match="and stays so"):
+        assert error(load_scene(scene_file(tmp_path, text), as_is=True)) > 0.05
+
+
+def test_closed_start_is_what_the_scenes_own_soft_law_comes_to(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, GEARED))
+    model = mujoco.MjModel.from_xml_string(GEARED.replace('damping=".01"', 'damping=".001"'))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 5000)
+    assert scene.data.qpos[7:] == pytest.approx(data.qpos[7:], abs=5e-3)
+
+
+def test_run_its_reset_and_its_audit_start_on_the_constraints(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, GEARED))
+    with hb.Bridge(
+        scene, "simulated", clock=hb.SimulatedClock(), recording=tmp_path / "run.mcap"
+    ) as bridge:
+        bridge.run(duration=0.2)
+    mujoco.mj_resetData(scene.model, scene.data)
+    scene.reset()
+    assert error(scene) < 1e-8
+    report = hb.audit(tmp_path / "run.mcap")
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+def test_carried_tool_keeps_the_closed_start(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, BEYOND))
+    scene.carry_tool("asked for")
+    assert scene.data.joint("elbow").qpos[0] == pytest.approx(np.deg2rad(20.0))
+
+
+def test_constraint_that_cannot_be_closed_is_left_and_said(tmp_path: Path) -> None:
+    far = GEARED.replace('damping=".01" ', 'damping=".01" range="-5 5"')
+    with pytest.warns(UserWarning, match="joint equality of joint 'j1' and 'j2' starts 28.6 deg"):
+        scene = load_scene(scene_file(tmp_path, far))
+    assert not started_said(scene)
+    assert not scene.data.qpos[7:].any()
+
+
+def test_start_on_its_constraints_adds_nothing_to_the_scene(tmp_path: Path) -> None:
+    good = BEYOND.replace('range="20 90"', 'range="-20 90"')
+    scene = load_scene(scene_file(tmp_path, good))
+    assert (scene.model.nkey, started_said(scene)) == (0, [])
+    closed = load_scene(scene_file(tmp_path, BEYOND))
+    assert closed.model.key(0).name == "home"
+    assert np.array_equal(closed.data.mocap_pos[-1], closed.data.site("grip").xpos)
+
+
+def test_servo_of_a_closed_start_keeps_its_own_target(tmp_path: Path) -> None:
+    text = BEYOND.replace(
+        "</worldbody>", '</worldbody><actuator><position joint="elbow" kp="5"/></actuator>'
+    )
+    scene = load_scene(scene_file(tmp_path, text))
+    assert scene.data.ctrl[0] == 0.0
+
+
+# Mocap bodies that hold the grip
+
+HELD = """<mujoco><worldbody>
+  <body name="target" mocap="true" pos="0 0 .2"/>
+  <body name="far" mocap="true" pos="1 0 .2"/>
+  <body name="palm" pos="0 0 .2" gravcomp="1"><freejoint/>
+    <geom type="box" size=".03 .03 .03" mass=".2"/><site name="palm_site"/>
+    <body name="finger" pos="0 0 .05" gravcomp="1"><joint type="slide" axis="1 0 0"/>
+      <geom size=".01" mass=".02" contype="0" conaffinity="0"/></body>
+    <body name="lever" pos="0 0 -.05" gravcomp="1"><joint axis="0 1 0"/><joint axis="1 0 0"/>
+      <geom size=".01" pos="0 0 -.1" mass=".02" contype="0" conaffinity="0"/></body></body>
+  <body name="other" pos="1 0 .2" gravcomp="1"><freejoint/><geom size=".02" mass=".1"/></body>
+  </worldbody><equality><weld body1="far" body2="other"/>{}</equality></mujoco>"""
+WELD = '<weld body1="target" body2="palm"/>'
+CONNECT = '<connect name="pin" body1="palm" body2="target" anchor="0 0 0"/>'
+REPLACED = "grip held by mocap body 'target' → by the hand alone"
+
+
+def tool_way(scene: Scene) -> float:
+    """Way in m that the grip follows a hand that moves by its slow path."""
+    scene_grip = scene.grip
+    with hb.Bridge(scene, "simulated", clock=hb.SimulatedClock()) as bridge:
+        before = scene.data.site(scene_grip).xpos.copy()
+        bridge.run(duration=1.0)
+        return float(np.linalg.norm(scene.data.site(scene_grip).xpos - before))
+
+
+@pytest.mark.parametrize(("grip", "holding"), [("palm", WELD), ("finger", WELD), ("palm", CONNECT)])
+def test_hand_takes_the_place_of_the_mocap_body_that_holds_its_grip(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grip: str, holding: str
+) -> None:
+    path = scene_file(tmp_path, HELD.format(holding))
+    scene = load_scene(path, grip=grip)
+    assert REPLACED in scene.changes
+    assert scene.model.eq_active0.tolist() == [1, 0]
+    assert tool_way(scene) > 1e-3
+    # beside the constraint, the palm stays where it is
+    monkeypatch.setattr("hapticbridge.scene.load.take_over_mocap", lambda *_, **__: ((), []))
+    if grip == "palm":
+        assert tool_way(load_scene(path, grip=grip)) < 1e-5
+    monkeypatch.undo()
+    with pytest.raises(hb.SceneError, match="held in place by mocap body 'target'; write active="):
+        load_scene(path, grip=grip, as_is=True)
+
+
+def test_run_without_the_mocap_body_it_replaces_is_audited_bit_for_bit(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, HELD.format(WELD)), grip="palm")
+    scene.carry_tool("asked for")
+    assert not scene.model.eq_active0[1]
+    with hb.Bridge(
+        scene, "simulated", clock=hb.SimulatedClock(), recording=tmp_path / "run.mcap"
+    ) as bridge:
+        bridge.run(duration=0.2)
+    assert hb.audit(tmp_path / "run.mcap").resimulation == "bit for bit"
+
+
+def test_mocap_body_beside_which_the_grip_moves_is_left_and_named(tmp_path: Path) -> None:
+    path = scene_file(tmp_path, HELD.format(WELD))
+    with pytest.warns(UserWarning, match="'target' holds the tool and leaves the grip 2 of 6 of"):
+        scene = load_scene(path, grip="lever")
+    assert scene.model.eq_active0.all()
+    assert REPLACED not in scene.changes
+    # of two mocap bodies, the one that holds the other body is never named
+    assert not any("far" in change for change in load_scene(path, grip="palm").changes)
+
+
+# Overlaps and loads, in words that are true
+
+PAIR = """<body name="link" pos="1 0 .3"><joint axis="0 1 0"/><geom name="a" size=".05"/>
+  <body><joint axis="1 0 0"/><geom size=".001" mass=".1"/>
+    <body name="nested" pos="0 0 .06"><joint axis="0 1 0"/><geom name="b" size=".02"/></body>
+  </body></body>"""
+
+
+@pytest.mark.parametrize("is_explicit", [False, True])
+def test_only_a_contact_that_an_exclusion_ends_is_said_to_be_off(
+    tmp_path: Path, *, is_explicit: bool
+) -> None:
+    pair = '<contact><pair geom1="b" geom2="a"/></contact>' if is_explicit else ""
+    scene = load_scene(scene_file(tmp_path, scene_text(PAIR, pair)))
+    assert scene.data.ncon == is_explicit
+    said = [change for change in scene.changes if "overlap by 10 mm" in change]
+    assert len(said) == 1
+    assert ("on → off" in said[0]) != is_explicit
+    assert ("eased out" in said[0]) == is_explicit
+
+
+LOADED = """<mujoco><option gravity="0 0 -10"/><worldbody>
+  <body name="tool" pos=".5 0 1"><freejoint/><geom size=".04" mass="1"/><site name="grip"/></body>
+  <body name="arm" pos="0 0 1"><joint type="ball"/>
+    <geom type="capsule" size=".01" fromto="0 0 0 .5 0 0" mass="2" contype="0" conaffinity="0"/>
+    <site name="end" pos=".5 0 0"/>
+    </body>
+  <body name="weight" pos=".5 0 .7"><freejoint/><geom size=".02" mass=".5"/>
+    <site name="hook"/></body>
+  <body name="apart" pos="2 0 1"><freejoint/><geom size=".02" mass=".5"/></body></worldbody>
+  <tendon><spatial range="0 .3"><site site="grip"/><site site="hook"/></spatial></tendon>
+  <equality><weld site1="end" site2="grip"/></equality></mujoco>"""
+
+
+def test_parts_welded_to_the_tool_are_carried_with_it_and_loads_on_tendons_are_named(
+    tmp_path: Path,
+) -> None:
+    scene = load_scene(scene_file(tmp_path, LOADED))
+    scene.carry_tool("asked for")
+    assert (
+        "weight of the tool: felt → carried, but not that of 'weight' on its tendons (asked for)"
+        in (scene.changes)
+    )
+    bodies = "tool", "arm", "weight", "apart"
+    assert [float(scene.model.body_gravcomp[scene.model.body(name).id]) for name in bodies] == [
+        1.0,
+        1.0,
+        0.0,
+        0.0,
+    ]
+    mujoco.mj_step(scene.model, scene.data, 200)
+    # what is carried stays without a hand, but for the pull of the load
+    assert scene.data.body("apart").xpos[2] < 0.9
+    off = load_scene(scene_file(tmp_path, LOADED.replace('range="0 .3"', "")))
+    off.carry_tool("asked for")
+    mujoco.mj_step(off.model, off.data, 200)
+    assert off.data.site("grip").xpos == pytest.approx([0.5, 0, 1], abs=1e-6)
+
+
+def test_a_load_that_sinks_in_the_hand_is_named_with_its_energy(tmp_path: Path) -> None:
+    text = LOADED.replace('range="0 .3"', 'range="0 .31"').replace("<equality>", "<!--").replace(
+        "</equality>", "-->"
+    )  # fmt: skip
+    scene = load_scene(scene_file(tmp_path, text))
+    scene.carry_tool("asked for")
+    with hb.Bridge(
+        scene, "simulated", clock=hb.SimulatedClock(), recording=tmp_path / "run.mcap"
+    ) as bridge:
+        summary = bridge.run(duration=1.0)
+    released = summary.hand_energy.scene
+    # the weight of 5 N sinks with the hand, which the simulated springs of 135 N/m let down
+    assert released == pytest.approx(-summary.energies["coupling_work"], rel=0.01)
+    assert released > 0.04
+    words = f"gave the hand {1e3 * released:.3g} mJ, as weights that sink and springs do"
+    assert words in str(summary)
+    assert words in hb.audit(tmp_path / "run.mcap").reason
