@@ -62,7 +62,7 @@ def right_speed(mu: float, depth: float, force: float, time: float) -> float:
     inverse = model.body_invweight0[1, 0]
     each = stiffness * impedance**2 * depth / ((1.0 - impedance) * inverse)
     net = max(force - mu * 3.0 * each, 0.0)  # a cylinder on a plane has three points
-    return net / DAMPING * (1.0 - math.exp(-time * DAMPING / MASS))
+    return float(net / DAMPING * (1.0 - math.exp(-time * DAMPING / MASS)))
 
 
 @pytest.mark.parametrize("method", ["implicit", "lossless"])

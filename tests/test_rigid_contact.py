@@ -246,7 +246,7 @@ def worst_gradient(run: Run, seed: int) -> float:
     return max(worst)
 
 
-@pytest.mark.parametrize("seed", [39, 140])
+@pytest.mark.parametrize("seed", [66, 140])
 def test_a_solution_that_does_not_converge_is_replaced_by_one_that_does(seed: int) -> None:
     """Newton's method goes round in circles in these jams."""
     results = {}

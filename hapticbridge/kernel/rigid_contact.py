@@ -368,7 +368,7 @@ def _stiffness_over_inertia(s: State, contact: int, depth: float) -> float:
     stiffness = -solref[0] / last**2
     if solref[0] > 0.0:
         stiffness = 1.0 / (last * max(solref[0], 2.0 * s.run.timestep) * solref[1]) ** 2
-    return stiffness * d**2 / (1.0 - d)
+    return float(stiffness * d**2 / (1.0 - d))
 
 
 @compiled
