@@ -127,7 +127,7 @@ def decoded(report: bytes) -> Deflection | Buttons | None:
 
 
 def deflection(count: int, dead_band: float) -> float:
-    """Returns a reported count as a deflection relative to full scale, −1 to 1, 0 within the dead band d.
+    """Returns the deflection of a reported count, −1 to 1 of full scale, 0 within the dead band d.
 
         sign(c) · max(0, |c| − d)/(1 − d),    c = count/350 clamped to ±1,    0 <= d < 1
 
