@@ -55,7 +55,7 @@ def test_arbitrary_bytes_are_read_without_a_crash(data: bytes) -> None:
     news = decoded(data)
     assert news is None or data[0] in (1, 2, 3)
     if isinstance(news, driver.Deflection):
-        assert all(abs(driver.share(count, 0.05)) <= 1.0 for count in news.counts)
+        assert all(abs(driver.deflection(count, 0.05)) <= 1.0 for count in news.counts)
     elif isinstance(news, driver.Buttons):
         assert 0 <= news.bits < 2**48
 
@@ -70,8 +70,8 @@ def test_buttons_are_a_little_endian_bitmap_of_any_length(report: str, bits: int
 
 @given(st.integers(-40000, 40000), st.floats(0.0, 0.9))
 def test_deflection_beyond_the_dead_band_is_linear_odd_and_clamped(count: int, band: float) -> None:
-    value = driver.share(count, band)
-    assert driver.share(-count, band) == -value
+    value = driver.deflection(count, band)
+    assert driver.deflection(-count, band) == -value
     assert value * count >= 0.0
     if abs(count) >= 350:
         assert abs(value) == 1.0

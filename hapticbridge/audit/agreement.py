@@ -85,13 +85,13 @@ def metadata_statements(recordings: Sequence[RecordingFile]) -> Iterator[Stateme
     for setup, own in zip(setups_of(meta), metas_of(meta), strict=True):
         stored = parameters_of(own)
         with refused_request():
-            found = setup.unloaded(sample_at(stored.device_start), stored.effective)
-        found = replace(found, guarding=_loaded(found.guarding, stored.guarding))
+            rebuilt = setup.unloaded(sample_at(stored.device_start), stored.effective)
+        rebuilt = replace(rebuilt, guarding=_loaded(rebuilt.guarding, stored.guarding))
         if not setup.workspace.absolute:
-            found = replace(found, handle_origin=stored.handle_origin)
+            rebuilt = replace(rebuilt, handle_origin=stored.handle_origin)
         if not setup.method.is_weld:
-            found = replace(found, effective=None)
-        yield from _differences(own, request.description(setup, found), source)
+            rebuilt = replace(rebuilt, effective=None)
+        yield from _differences(own, request.description(setup, rebuilt), source)
 
 
 def _loaded(guard: GuardParameters, stored: GuardParameters) -> GuardParameters:

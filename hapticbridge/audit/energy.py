@@ -341,8 +341,8 @@ def _released(
         # m = max(m + δ, 0) is the sum above its lowest value, or above 0
         pushed[first:end] = (sums - np.minimum(np.minimum.accumulate(sums), 0.0))[1:]
         last, at_reset[first:end] = pushed[end - 1], base
-    given = at_reset - work[1:] - pushed
-    released = np.maximum(np.minimum(given, -stored), 0.0)
+    returned = at_reset - work[1:] - pushed
+    released = np.maximum(np.minimum(returned, -stored), 0.0)
     inputs = _summed(external, before["inputs"])
     return {"released": released, "pushed": pushed, "work_at_reset": at_reset, "inputs": inputs}
 

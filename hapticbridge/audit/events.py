@@ -174,8 +174,8 @@ class AuditedRun:
         loop = LoopSetting.of_run(self.info, run, self.method)
 
         def demand(coupling: Coupling, axis: str) -> tuple[float, float]:
-            found = conditions_of(replace(loop, law=coupling))
-            own = [(-each.margin, each.needed) for each in found if each.axis == axis]
+            conditions = conditions_of(replace(loop, law=coupling))
+            own = [(-each.margin, each.needed) for each in conditions if each.axis == axis]
             return max(own, default=(0.0, 0.0))
 
         linear, angular = (

@@ -68,11 +68,11 @@ def attached_scene(recording: RecordingFile) -> Scene:
     scene = compile_recorded(recording)
     if is_as_recorded(scene, recording):
         return scene
-    found = "the attached sources do not compile to the recorded model (scene_sha256)"
+    reason = "the attached sources do not compile to the recorded model (scene_sha256)"
     if not is_same_processor(recording):
-        raise ForeignModelError(f"{found}: another processor compiled it")
+        raise ForeignModelError(f"{reason}: another processor compiled it")
     raise RecordingError(
-        f"{found}: the recording was changed, or a program changed the model after loading"
+        f"{reason}: the recording was changed, or a program changed the model after loading"
     )
 
 

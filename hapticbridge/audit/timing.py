@@ -113,8 +113,8 @@ class TimingTally:
             self.wrenches = np.concatenate([self.wrenches, sent["wrench_on_device"]])
             times = np.concatenate([[self.since], sent["read_ns"]])
             lever = block.lever_before[first:end][chosen]
-            found = np.diff(np.concatenate([[self.stored], stored[first:end][chosen]]))
-            steps[first + chosen] = found + self._given(times, rows[first + chosen], sent, lever)
+            change = np.diff(np.concatenate([[self.stored], stored[first:end][chosen]]))
+            steps[first + chosen] = change + self._energy(times, rows[first + chosen], sent, lever)
             if len(chosen):
                 self.since, self.stored = int(times[-1]), float(stored[first + chosen[-1]])
             last = max(int(np.searchsorted(self.arrivals, self.since, "right")) - 1, 0)
@@ -131,7 +131,7 @@ class TimingTally:
             uncovered = uncovered + ratio * np.maximum(ticks["environment_energy"], 0.0)
         self.max_uncovered = max(self.max_uncovered, float(np.max(uncovered)))
 
-    def _given(
+    def _energy(
         self,
         times: NDArray[np.int64],
         before: NDArray[np.void],

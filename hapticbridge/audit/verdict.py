@@ -144,8 +144,8 @@ class AuditReport:
         values = asdict(self) | {"path": str(self.path), "margin": self.margin}
         for name in ("reason", "resimulation", "certified", "max_net_energy"):
             values[name] = getattr(self, name)
-        found = values.pop("certification") and self.certification
-        values |= found.to_dict() if found else {}
+        certification = values.pop("certification") and self.certification
+        values |= certification.to_dict() if certification else {}
         if not self.hands:
             del values["hands"]
         return json.dumps(finite_or_null(values), indent=2, allow_nan=False)
@@ -337,8 +337,8 @@ def decide_on_hands(
     """Decides over the tallies of all hands, as ``decide`` does; the worst verdict counts."""
     ranks = ("invalid", "active", "unverified", "passive")
     tallies = energies if fault is None else ()
-    found = [decide(report, fault, each, gap=gap, strict=strict) for each in tallies or (None,)]
-    return min(found, key=lambda each: (ranks.index(each.verdict), each.tick or 0))
+    verdicts = [decide(report, fault, each, gap=gap, strict=strict) for each in tallies or (None,)]
+    return min(verdicts, key=lambda each: (ranks.index(each.verdict), each.tick or 0))
 
 
 def decide(
@@ -561,10 +561,10 @@ class JudgedDevice:
             silence=timing.silence,
             silent_tick=timing.silent_tick,
         )
-        found = certification_of(run.info, run.worst, run.method, times, energy)
-        self.certification = found
-        if found.kept.conditions:
-            self.damping_margin = damping_margin(found.kept.conditions)
+        certification = certification_of(run.info, run.worst, run.method, times, energy)
+        self.certification = certification
+        if certification.kept.conditions:
+            self.damping_margin = damping_margin(certification.kept.conditions)
 
 
 def _joined(devices: Sequence[JudgedDevice]) -> dict[str, Any]:
@@ -574,7 +574,7 @@ def _joined(devices: Sequence[JudgedDevice]) -> dict[str, Any]:
     """
     has_several, first = len(devices) > 1, devices[0]
     margins = [each.damping_margin for each in devices if each.damping_margin is not None]
-    found = [each.certification for each in devices if each.certification is not None]
+    certifications = [each.certification for each in devices if each.certification is not None]
 
     def named(grip: str, sentences: Sequence[str]) -> list[str]:
         return [f"{grip}: {each}" if has_several else each for each in sentences]
@@ -590,7 +590,7 @@ def _joined(devices: Sequence[JudgedDevice]) -> dict[str, Any]:
             s for each in devices for s in named(each.grip, each.coupling_sentences[:1])
         ),
         "damping_margin": min(margins, default=None),
-        "certification": worst_certification(found) if found else None,
+        "certification": worst_certification(certifications) if certifications else None,
     }
 
 
@@ -599,10 +599,10 @@ _OF_A_HAND = ("coupling_work", "device_energy")
 
 def _energies_of_hands(tallies: Sequence[PassivityTally]) -> dict[str, float]:
     """Returns the energies at the end in J; what each hand has of its own is added up."""
-    found = dict(tallies[0].energies)
+    energies = dict(tallies[0].energies)
     for name in _OF_A_HAND:
-        found[name] = sum(tally.energies[name] for tally in tallies)
-    return found
+        energies[name] = sum(tally.energies[name] for tally in tallies)
+    return energies
 
 
 _SHARED = ("tick", *CLOCK_FIELDS, "kinetic", "potential", "actuator_work", "external_work")
@@ -658,11 +658,11 @@ def _compared_in_ticks(
 
 def _remarks(report: AuditReport, events: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
     """Returns what a reason adds on a recording without a fault, in clauses; some are empty."""
-    found = report.certification
-    silence = found and found.kept.silence
+    certification = report.certification
+    silence = certification and certification.kept.silence
     return (
         silence.sentence if silence else "",
-        found.reason if found else "",
+        certification.reason if certification else "",
         _hand_words(report),
         unusual_end(report.trip, events),
         report.unchecked,

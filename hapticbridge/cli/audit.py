@@ -347,14 +347,14 @@ def _print_report(report: AuditReport) -> None:
         out.print(f"  simulated again: {report.resimulation}")
     for sentence in report.findings:
         out.print(f"  [yellow]the run warned:[/yellow] {plain(sentence)}")
-    found = report.certification
+    certification = report.certification
     for sentence in report.couplings:
         out.print(f"  {plain(sentence)}")
-    in_time = ", with every tick in time" if found and found.is_by_time else ""
+    in_time = ", with every tick in time" if certification and certification.is_by_time else ""
     for sentence in report.conditions:
         out.print(f"  {plain(sentence)}{in_time}")
-    if found is not None:
-        out.print(f"  {plain(found.words)}")
+    if certification is not None:
+        out.print(f"  {plain(certification.words)}")
     if report.is_cut:
         mend = f"'hapticbridge repair {shlex.quote(str(report.path))} OUTPUT' makes it whole"
         hint = f"; {mend}" if report.lacks_end else ""
@@ -363,7 +363,7 @@ def _print_report(report: AuditReport) -> None:
     if unusual:
         listed = ", ".join(f"{name} ({count})" for name, count in unusual.items())
         out.print(f"  events: {plain(listed)}")
-    rate = f", {found.kept.remark}" if found and found.kept.remark else ""
+    rate = f", {certification.kept.remark}" if certification and certification.kept.remark else ""
     unfinished = "; the tick that tripped is not among them" if report.trip else ""
     out.print(f"  {report.ticks} ticks, {report.duration:.3f} s{rate}{unfinished}")
     if energies := [" ".join(row) for row in energy_rows(report.energies, report.start_potential)]:

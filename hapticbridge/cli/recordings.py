@@ -186,24 +186,24 @@ class Export:
                 overwrite=self.overwrite,
                 hand=self.hand,
             )
-        found = done.recording
-        marks = [time_of(event) for event in found.events if event.get("event") == "mark"]
+        recording = done.recording
+        marks = [time_of(event) for event in recording.events if event.get("event") == "mark"]
         if self.as_json:
             facts = {"files": [str(file) for file in done.files], "ticks": done.ticks}
-            facts |= {"marks": marks, "is_cut": bool(found.cut_sentence)}
-            facts |= {"cut": found.cut_sentence, "damage": found.problems}
+            facts |= {"marks": marks, "is_cut": bool(recording.cut_sentence)}
+            facts |= {"cut": recording.cut_sentence, "damage": recording.problems}
             print_json(facts)
         else:
             names = ", ".join(plain(str(file)) for file in done.files)
             out.print(f"wrote {names}: {done.ticks} ticks, {len(done.events)} events")
             if marks:
                 out.print(f"marks at {', '.join(f'{time:.3f} s' for time in marks)}")
-        if found.cut_sentence:
-            err.print(f"[yellow]warning:[/yellow] {found.cut_sentence}; this is what it holds")
-        if found.problems:
-            damage = plain("; ".join(found.problems))
+        if recording.cut_sentence:
+            err.print(f"[yellow]warning:[/yellow] {recording.cut_sentence}; this is what it holds")
+        if recording.problems:
+            damage = plain("; ".join(recording.problems))
             err.print(f"[yellow]warning:[/yellow] the recording is damaged: {damage}")
-        return 1 if found.problems else 0
+        return 1 if recording.problems else 0
 
     def _write_dataset(self) -> int:
         """Writes a data set; returns the exit code."""
@@ -251,14 +251,14 @@ class Compare:
     def execute(self) -> int:
         """Compares; returns the exit code."""
         with err.status("comparing …"):
-            found = compare(self.first, self.second)
+            comparison = compare(self.first, self.second)
         if self.as_json:
-            out.print_json(found.to_json())
+            out.print_json(comparison.to_json())
         else:
-            _print(found)
-        for note in found.notes:
+            _print(comparison)
+        for note in comparison.notes:
             err.print(f"[yellow]warning:[/yellow] {plain(note)}")
-        return 0 if found.is_same else 1
+        return 0 if comparison.is_same else 1
 
 
 def _print(found: Comparison) -> None:

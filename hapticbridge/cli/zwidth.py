@@ -461,8 +461,8 @@ def _condition(info: DeviceInfo, coupling: Coupling, period: float) -> DampingCo
     """Returns the condition for translation that a run with scale 1 would print."""
     method = default_method()
     law = method.law_coupling(coupling, period)
-    found = conditions_of(LoopSetting(info=info, law=law, period=period, method=method))
-    return next(condition for condition in found if condition.axis == "translation")
+    conditions = conditions_of(LoopSetting(info=info, law=law, period=period, method=method))
+    return next(condition for condition in conditions if condition.axis == "translation")
 
 
 def _is_prompt(info: DeviceInfo, period: float) -> bool:

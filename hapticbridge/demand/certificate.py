@@ -354,16 +354,16 @@ _Part = Literal["stiffness", "damping", "period"]
 
 def _steps(loop: LoopSetting) -> StepCondition | None:
     """Returns the condition on encoder steps, with the changes that would meet it."""
-    found = StepCondition.of(loop)
-    if found is None or found.holds is not False:
-        return found
+    condition = StepCondition.of(loop)
+    if condition is None or condition.holds is not False:
+        return condition
     finer = "take a device with finer steps or more friction"
-    if not found.available:
+    if not condition.available:
         told = f"without friction no coupling is free of swings by steps: {finer}"
-        return replace(found, remedy=told)
-    less = NEEDED_SHARE * found.available / (found.needed or math.inf)
+        return replace(condition, remedy=told)
+    less = NEEDED_SHARE * condition.available / (condition.needed or math.inf)
     told = _both_lowered(loop, "translation", less)
-    return replace(found, remedy=f"{told}, or {finer}")
+    return replace(condition, remedy=f"{told}, or {finer}")
 
 
 def _both_lowered(loop: LoopSetting, axis: Axis, share: float) -> str:

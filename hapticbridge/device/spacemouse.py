@@ -126,8 +126,8 @@ def decoded(report: bytes) -> Deflection | Buttons | None:
     return None
 
 
-def share(count: int, dead_band: float) -> float:
-    """Returns a reported count as a share of full scale, −1 to 1, 0 within the dead band d.
+def deflection(count: int, dead_band: float) -> float:
+    """Returns the deflection of a reported count, −1 to 1 of full scale, 0 within the dead band d.
 
         sign(c) · max(0, |c| − d)/(1 − d),    c = count/350 clamped to ±1,    0 <= d < 1
 
@@ -283,8 +283,8 @@ class SpaceMouseDevice:
         news = decoded(report)
         if isinstance(news, Deflection):
             last = news.first + len(news.counts)
-            shares = [share(count, self._control.dead_band) for count in news.counts]
-            self._rate[news.first : last] = self._full[news.first : last] * shares
+            deflections = [deflection(count, self._control.dead_band) for count in news.counts]
+            self._rate[news.first : last] = self._full[news.first : last] * deflections
             self._silence = 0.0
         elif isinstance(news, Buttons):
             self._buttons = news.bits

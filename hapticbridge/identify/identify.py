@@ -303,10 +303,12 @@ class Identification:
         rotation.
         """
         fits = [fit for axis, fit in self.fits.items() if (len(axis) == 2) == turns]
-        found: list[Estimate] = [getattr(fit, name) for fit in fits]
-        if not found:
+        estimates: list[Estimate] = [getattr(fit, name) for fit in fits]
+        if not estimates:
             return None
-        return max(found, key=lambda e: e.most) if most else min(found, key=lambda e: e.least)
+        return (
+            max(estimates, key=lambda e: e.most) if most else min(estimates, key=lambda e: e.least)
+        )
 
 
 def identify(
@@ -444,11 +446,11 @@ def _checked_fit(run: AxisRun, info: DeviceInfo) -> AxisFit:
 
 
 def _resolution(info: DeviceInfo, runs: dict[str, AxisRun]) -> float | None:
-    found = [step_of(run.position) for axis, run in runs.items() if len(axis) == 1]
-    if not found:
+    steps = [step_of(run.position) for axis, run in runs.items() if len(axis) == 1]
+    if not steps:
         return None
     # joint encoders make no even steps in space; then the driver's value is used
-    return max(found) or info.resolution or 0.0
+    return max(steps) or info.resolution or 0.0
 
 
 # Plot of the identified law: resistance of each axis over its speed

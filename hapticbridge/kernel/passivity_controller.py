@@ -159,8 +159,8 @@ def observe_release(s: State) -> None:
     if abs(observer.input_work) > abs(observer.peak_input_work):
         observer.peak_input_work = observer.input_work
     lost = energy.start_energy + energy.others_work - (energy.kinetic + energy.potential)
-    given = observer.work_at_reset - energy.coupling_work - observer.pushed
-    observer.released = max(min(given, lost), 0.0)
+    returned = observer.work_at_reset - energy.coupling_work - observer.pushed
+    observer.released = max(min(returned, lost), 0.0)
 
 
 @compiled

@@ -126,7 +126,7 @@ def _advance(timing: Part, end: int) -> None:
 
 
 @compiled
-def _given(s: State, time: float, is_late: bool) -> float:
+def _energy(s: State, time: float, is_late: bool) -> float:
     """Returns E_k + u'_k·δp_k for a time τ in s."""
     t, w, u, work = s.timing, s.loop.wrench_on_device, s.loop.unfelt, 0.0
     for i in range(6):
@@ -183,8 +183,8 @@ def keep_account(s: State, deadline_ns: int, read_ns: int, write_ns: int) -> Non
     if t.is_new or not t.is_timed:
         stored, time = _stored(s), 1e-9 * (read_ns - t.since)
         if t.is_timed and time > 0.0:
-            given = _given(s, time, time > LATE * s.run.period)
-            t.uncovered = max(t.uncovered + given + stored - t.stored, -credit)
+            energy = _energy(s, time, time > LATE * s.run.period)
+            t.uncovered = max(t.uncovered + energy + stored - t.stored, -credit)
         t.stored, t.since, t.now = stored, read_ns, read_ns
         t.newest += 1
         t.arrivals[t.newest % RING] = write_ns + t.device_delay_ns

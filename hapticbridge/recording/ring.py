@@ -147,10 +147,10 @@ def _opened(path: str | Path, flags: int) -> int:
     file = os.open(path, flags | _GUARDED, 0o600)
     if sys.platform == "win32":
         return file
-    found = os.fstat(file)
+    status = os.fstat(file)
     if flags & os.O_CREAT:
         os.fchmod(file, 0o600)
-    elif not stat.S_ISREG(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+    elif not stat.S_ISREG(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o022:
         os.close(file)
         raise OSError(errno.EPERM, "it is not a file that this user alone can write")
     return file

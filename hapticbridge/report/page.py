@@ -189,10 +189,10 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
         ("largest force", format_wrenches(None if evidence.info.is_prescribed else hand, tool)),
         ("controller", _controller_words(evidence)),
     ]
-    if (found := report.certification) is not None:
-        facts.append(("device condition", found.fact))
-        if found.kept.remark:
-            facts.append(("time kept", found.kept.remark))
+    if (certification := report.certification) is not None:
+        facts.append(("device condition", certification.fact))
+        if certification.kept.remark:
+            facts.append(("time kept", certification.kept.remark))
     if report.slack_share:
         facts.append(("slack used", format_share(report.slack_share)))
     return [*facts, ("simulated again", report.resimulation or "not reached")]
@@ -350,8 +350,8 @@ def notes(report: AuditReport) -> list[str]:
     # a run that was passive only because its force was switched off must not look like any other
     remarks = "; ".join(report.remarks)
     stop = [f"{remarks[:1].upper()}{remarks[1:]}."] if remarks else []
-    found = report.certification
-    device = [found.note] if found and report.verdict == "passive" else []
+    certification = report.certification
+    device = [certification.note] if certification and report.verdict == "passive" else []
     return [*stop, *device, *warned]
 
 

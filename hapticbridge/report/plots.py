@@ -151,8 +151,8 @@ def _draw_hand(
     for axes in panels:
         finish(axes)
     if has_several_hands:
-        found = recorded_coupling(recording)
-        shown = found.effective or found.law
+        coupling = recorded_coupling(recording)
+        shown = coupling.effective or coupling.law
         gains = f"K = {shown.stiffness:.4g} N/m, B = {shown.damping:.3g} N s/m" if shown else ""
         head = f"{printable(parameters.grip)}: {gains}"
         force_axes.set_title(head, fontsize="small", loc="left", pad=46, parse_math=False)

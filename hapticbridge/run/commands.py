@@ -269,14 +269,14 @@ class AxisCouplingLimits:
         """Returns the condition on encoder steps of a requested coupling; None without a limit."""
         if self.axis == "rotation":
             return None
-        found = StepCondition.of(replace(self.run.loop, law=self.run.law(requested)))
-        return None if found is None or found.holds is None else found
+        condition = StepCondition.of(replace(self.run.loop, law=self.run.law(requested)))
+        return None if condition is None or condition.holds is None else condition
 
     @cached_property
     def friction(self) -> float:
         """Friction in N that holds encoder steps; without any, what the start's coupling needs."""
-        found = self.steps(self.run.start)
-        return math.inf if found is None else found.available or found.needed or 0.0
+        steps = self.steps(self.run.start)
+        return math.inf if steps is None else steps.available or steps.needed or 0.0
 
     def needed(self, stiffness: float, damping: float) -> float:
         """Returns the device damping b in N s/m or N m s/rad that requested gains need.

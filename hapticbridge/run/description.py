@@ -169,8 +169,8 @@ def meta_count(meta: Mapping[str, str], name: str) -> int:
 def versions() -> dict[str, str]:
     """Returns the versions on which a bit-exact repetition depends."""
     packages = ("hapticbridge", "mujoco", "numba", "numpy", "scipy", "mcap")
-    found = {name: _version_of(name) for name in packages}
-    return found | {"python": platform.python_version()}
+    versions = {name: _version_of(name) for name in packages}
+    return versions | {"python": platform.python_version()}
 
 
 _version_of = cache(version)  # parses the package's metadata: 2 ms each

@@ -66,14 +66,14 @@ class SlowScene:
         self._front, self._model, self._data = front, model, data
         self._scene_ticks, self._substeps = parameters.scene_ticks, range(parameters.substeps)
         self._scene_period, self._loop_period = parameters.of_scene.period, parameters.period
-        self._given = np.zeros(1, SAMPLE_DTYPE)
+        self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._changes: deque[Callable[[], None]] = deque()
         self._publish: Callable[[BoundKernel], None] | None = None
         shown = front.state["shown"]
         self._age, self._waits = shown["age"], shown["waits"]
         state, row = self.bound.state, self.bound.row
-        self._take_result = direct(take_result, front.state, state, self._given)
-        self._before = direct(before_step, state, self._given, row, 0, 0.0)
+        self._take_result = direct(take_result, front.state, state, self._sample)
+        self._before = direct(before_step, state, self._sample, row, 0, 0.0)
         self._end = direct(after_step, state, row, 0)
         self.step = self.bound.step
         self._thread: threading.Thread | None = None
@@ -148,7 +148,7 @@ class SlowScene:
             if self._code != OK:
                 fail_scene(self._front.state["shown"], self._code)
                 return
-        self._take_result(self._front.state, self.bound.state, self._given)
+        self._take_result(self._front.state, self.bound.state, self._sample)
         self._apply_changes()
         if self._publish is not None:
             self._publish(self.bound)
@@ -181,7 +181,7 @@ class SlowScene:
         """Runs one tick of the scene; returns ``OK``, or why its result is not usable."""
         state, row, period = self.bound.state, self.bound.row, self._scene_period
         for substep in self._substeps:
-            if self._before(state, self._given, row, substep, period) != OK:
+            if self._before(state, self._sample, row, substep, period) != OK:
                 return BAD_RESULT
             self.step(self._model, self._data)
             code = self._end(state, row, substep)
@@ -217,7 +217,7 @@ class SlowScene:
         Changes are applied after the next result, as in the live loop.
         """
         states = self._front.state, self.bound.state
-        own = self._front.row, self.bound.row, self._given
+        own = self._front.row, self.bound.row, self._sample
         step, done = self._front.state["shown"]["scene_step"], 0
         while done < len(samples):
             end, is_taken = len(samples), False

@@ -265,8 +265,8 @@ class Summary:
     def at_record(self, record: np.void) -> Summary:
         """Returns the summary with the energies of a tick's record."""
         names = record.dtype.names or ()
-        found = {name: float(record[name]) for name in self.energies if name in names}
-        return replace(self, energies=self.energies | found)
+        energies = {name: float(record[name]) for name in self.energies if name in names}
+        return replace(self, energies=self.energies | energies)
 
     @staticmethod
     def of_hands(hands: tuple[Summary, ...]) -> Summary:
@@ -385,14 +385,14 @@ class Summary:
 
     def _device_lines(self) -> Iterator[str]:
         """Yields if the device bears the coupling at the time that the run kept."""
-        found = self.certification
-        if found.is_by_time:
-            yield f"device not certified: {found.reason}"
+        certification = self.certification
+        if certification.is_by_time:
+            yield f"device not certified: {certification.reason}"
             return
-        yield found.words
-        if not found.verdict and found.standing is not Standing.NO_HAND:
+        yield certification.words
+        if not certification.verdict and certification.standing is not Standing.NO_HAND:
             yield from self.conditions
-        if found.verdict is False and method_named(self.method).has_law:
+        if certification.verdict is False and method_named(self.method).has_law:
             yield "only --energy-limit bounds what the hand gets"
 
     @property

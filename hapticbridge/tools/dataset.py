@@ -274,10 +274,10 @@ class LeRobotWriter:
 def _statistics(values: NDArray[Any], count: int) -> dict[str, Any]:
     """Returns LeRobot's statistics of numbers, (n,) or (n, k), over the first axis."""
     values = values.astype(np.float64).reshape(len(values), -1)
-    found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0)}
-    found["std"] = values.std(0)
-    found |= {name: np.quantile(values, share, axis=0) for name, share in _QUANTILES.items()}
-    return {name: value.tolist() for name, value in found.items()} | {"count": [count]}
+    statistics = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0)}
+    statistics["std"] = values.std(0)
+    statistics |= {name: np.quantile(values, share, axis=0) for name, share in _QUANTILES.items()}
+    return {name: value.tolist() for name, value in statistics.items()} | {"count": [count]}
 
 
 def _pixels(pictures: Sequence[bytes]) -> NDArray[np.float64]:

@@ -380,12 +380,12 @@ class _Experiment:
         )
 
     def _agreement(self) -> str:
-        found = compare(self.run.recording.path, self.path)
-        if found.first is None and not any(found.alone):
+        comparison = compare(self.run.recording.path, self.path)
+        if comparison.first is None and not any(comparison.alone):
             return "with nothing changed the prescribed run is the recorded one in every bit"
-        if found.first is None:
-            return f"with nothing changed the prescribed run has {found.ticks[1]} ticks"
-        first = found.first
+        if comparison.first is None:
+            return f"with nothing changed the prescribed run has {comparison.ticks[1]} ticks"
+        first = comparison.first
         return (
             f"with nothing changed the prescribed run differs from the recorded one from tick "
             f"{first.ticks[0]} on, in {first.column}, by {first.size:.3g} {first.unit}"

@@ -235,17 +235,17 @@ class FalconDevice:
         """
         if not self._is_started:
             raise DeviceError(f"{self._name} is read before it was started; call start() first")
-        found = 0
+        replies = 0
         for packet in self._link.take():
-            found += self._stream.feed(packet)
+            replies += self._stream.feed(packet)
         if self._watch.was_away(self._link.now()):
             self._requested = self._requested_before = ask_anew(
                 self._link, self._stream, self._name
             )
-            found = 1
+            replies = 1
         now = self._link.now()
         is_believed = False
-        if found:
+        if replies:
             # the reply answers the last request or the one before, so its pose is at most that old
             elapsed, self._sample_time = now - self._sample_time, self._requested_before
             verdict = self._believe(self._motion, self._stream.reply, self._last, elapsed)

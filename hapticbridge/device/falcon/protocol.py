@@ -283,12 +283,12 @@ def ask(link: Link, stream: ReplyStream, flags: int, timeout: float) -> bool:
 def answers(link: Link, stream: ReplyStream, timeout: float) -> int:
     """Waits up to ``timeout`` s for at least one reply, and returns the number of replies."""
     end = link.now() + timeout
-    found = 0
-    while not found and (left := end - link.now()) > 0:
+    replies = 0
+    while not replies and (left := end - link.now()) > 0:
         link.wait(left)
         for packet in link.take():
-            found += stream.feed(packet)
-    return found
+            replies += stream.feed(packet)
+    return replies
 
 
 def speaks(link: Link, stream: ReplyStream) -> bool:

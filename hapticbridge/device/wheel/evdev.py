@@ -185,18 +185,18 @@ class InputNode:
         Raises:
             DeviceLost: The device is gone.
         """
-        found: list[tuple[int, int, int]] = []
+        events: list[tuple[int, int, int]] = []
         while True:
             try:
                 data = self._kernel.read(self._file, _BATCH * _EVENT.size)
             except BlockingIOError:
-                return found
+                return events
             except OSError as error:
                 raise self._lost(error) from None
             self._note("<", data)
-            found += [(kind, code, value) for _, _, kind, code, value in _EVENT.iter_unpack(data)]
+            events += [(kind, code, value) for _, _, kind, code, value in _EVENT.iter_unpack(data)]
             if len(data) < _BATCH * _EVENT.size:
-                return found
+                return events
 
     def upload(self, level: int, length_ms: int, effect: int = -1) -> int:
         """Creates or changes an effect of a constant force; returns its number.

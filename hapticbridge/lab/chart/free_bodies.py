@@ -207,8 +207,8 @@ def exact_orientations(grid: float, count: int) -> NDArray[np.float64]:
     if abs(every * FINE_STEP / grid - 1) > 1e-9:
         raise StudyError(f"{grid:g} s is no multiple of the reference's {FINE_STEP:g} s")
     motion = integrate_rotation(SPINNING_INERTIA, SPIN, FINE_STEP, every * count, "midpoint")
-    found = motion.orientation[every::every]
-    return np.where(found[:, :1] < 0, -found, found)
+    orientation = motion.orientation[every::every]
+    return np.where(orientation[:, :1] < 0, -orientation, orientation)
 
 
 class SpinningBody(Staged):
@@ -331,14 +331,14 @@ def exact_arm(coupling: Coupling, grid: float, count: int) -> NDArray[np.void]:
         return [rate, torque / ARM_INERTIA]
 
     times = grid * np.arange(1.0, count + 1)
-    found = solve_ivp(
+    solution = solve_ivp(
         rates, (0.0, times[-1]), [0.0, 0.0], "DOP853", t_eval=times, rtol=1e-10, atol=1e-12
     ).y
     records = np.zeros(count, TICK_DTYPE)
-    for k, (time, angle, rate) in enumerate(zip(times, *found, strict=True)):
+    for k, (time, angle, rate) in enumerate(zip(times, *solution, strict=True)):
         place, pull = force(time, angle, rate)
         records["tool_position"][k, :2], records["wrench_on_tool"][k, :2] = place, pull
-    turned = Rotation.from_rotvec(np.outer(found[0], (0.0, 0.0, 1.0))).as_quat(
+    turned = Rotation.from_rotvec(np.outer(solution[0], (0.0, 0.0, 1.0))).as_quat(
         canonical=True, scalar_first=True
     )
     records["tool_quaternion"] = turned

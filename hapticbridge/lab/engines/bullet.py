@@ -189,8 +189,8 @@ class PybulletSimulation(HeldSimulation):
 
     def principal_pose(self, body: int = 0) -> base.Pose:
         """Returns the pose of the principal axes of inertia at a body's centre of mass."""
-        found = pybullet.getBasePositionAndOrientation(self._bodies[body], self._client)
-        position, (x, y, z, w) = found
+        pose = pybullet.getBasePositionAndOrientation(self._bodies[body], self._client)
+        position, (x, y, z, w) = pose
         return base.Pose(position, (w, x, y, z))
 
     def velocity(self, body: int = 0) -> base.Velocity:

@@ -155,8 +155,8 @@ class DrakeSimulation(HeldSimulation):
         if not self._is_finite:
             return base.Pose((np.nan,) * 3, (np.nan,) * 4)
         start = self._positions[body]
-        found = self._plant.GetPositions(self._context)[start : start + 7]
-        w, i, j, k, x, y, z = found.tolist()
+        pose = self._plant.GetPositions(self._context)[start : start + 7]
+        w, i, j, k, x, y, z = pose.tolist()
         return base.Pose((x, y, z), (w, i, j, k))
 
     def velocity(self, body: int = 0) -> base.Velocity:
@@ -164,8 +164,8 @@ class DrakeSimulation(HeldSimulation):
         if not self._is_finite:
             return base.Velocity((np.nan,) * 3, (np.nan,) * 3)
         start = self._velocities[body]
-        found = self._plant.GetVelocities(self._context)[start : start + 6]
-        a, b, c, x, y, z = found.tolist()
+        velocity = self._plant.GetVelocities(self._context)[start : start + 6]
+        a, b, c, x, y, z = velocity.tolist()
         return base.Velocity((x, y, z), (a, b, c))
 
     def contacts(self) -> base.Contacts:

@@ -146,7 +146,7 @@ def library() -> Any:
     """
     for name in _NAMES:
         try:
-            found = ctypes.CDLL(name)
+            library = ctypes.CDLL(name)
         except OSError:
             continue
         llvmlite.binding.load_library_permanently(name)
@@ -154,14 +154,14 @@ def library() -> Any:
     else:
         raise StudyError(MISSING)
     for name, (result, *arguments) in _SIGNATURES.items():
-        function = getattr(found, name)
+        function = getattr(library, name)
         function.restype, function.argtypes = result, arguments
-    if b"ODE_double_precision" not in found.dGetConfiguration().split():
+    if b"ODE_double_precision" not in library.dGetConfiguration().split():
         raise StudyError("the installed ODE was built in single precision; double is needed")
-    found.dInitODE2(0)
+    library.dInitODE2(0)
     # ODE reports a degenerate step, which it then performs anyway
-    found.dSetMessageHandler(ctypes.cast(_SILENT, c_void_p))
-    return found
+    library.dSetMessageHandler(ctypes.cast(_SILENT, c_void_p))
+    return library
 
 
 def _silence(_number: int, _text: bytes, _arguments: int) -> None:
