@@ -170,7 +170,7 @@ def test_path_of_the_peg_starts_at_home_and_rests_at_every_pose() -> None:
     places, turns = peg.peg_path(np.array([0.0]))
     np.testing.assert_allclose(places[0], 0.0, atol=1e-15)
     for index, (place, turn) in enumerate(peg.POSES):
-        end = peg.end_of_hold(index) - 1e-6
+        end = peg.end_of_pose(index) - 1e-6
         places, turns = peg.peg_path(np.array([end - 0.3, end]))
         np.testing.assert_allclose(places + peg.HOME, [place, place], atol=1e-12)
         rotated = Rotation.from_quat(turns[-1, [1, 2, 3, 0]]).as_rotvec()

@@ -99,15 +99,15 @@ def _loaded(guard: GuardParameters, stored: GuardParameters) -> GuardParameters:
 
     The scene determines it; without the scene it must be one load >= 0 in all of them.
     """
-    found: dict[str, Any] = {}
+    changes: dict[str, Any] = {}
     for kind in ("force", "torque"):
         idle, hold = f"idle_{kind}", f"hold_{kind}"
         load = getattr(stored, idle) - getattr(guard, idle)
         if load >= 0:
             held, own = getattr(guard, hold) + load, getattr(stored, hold)
-            found |= {idle: getattr(stored, idle)}
-            found |= {hold: own if _agrees(own, held, is_exact=False) else held}
-    return replace(guard, **found)
+            changes |= {idle: getattr(stored, idle)}
+            changes |= {hold: own if _agrees(own, held, is_exact=False) else held}
+    return replace(guard, **changes)
 
 
 def _differences(
@@ -192,8 +192,8 @@ def scene_statements(
         parameters = parameters_of(own)
         sample = sample_at(parameters.device_start)
         with refused_request():
-            found = setup.parameters(sample, parameters.effective)
-        derived = request.description(setup, found)
+            applied = setup.parameters(sample, parameters.effective)
+        derived = request.description(setup, applied)
         yield from _differences(own, derived, source, is_exact=is_exact)
 
 

@@ -312,8 +312,8 @@ class PassivityTally:
 
 def _peak(before: float, works: NDArray[np.float64]) -> float:
     """Returns the work of largest size, the earlier one among equals."""
-    found = np.append(before, works)
-    return float(found[np.argmax(np.abs(found))])
+    joined = np.append(before, works)
+    return float(joined[np.argmax(np.abs(joined))])
 
 
 def _first(
@@ -476,16 +476,16 @@ def verdict_on(
 
 def _hand_words(report: AuditReport) -> str:
     """Returns clauses on hands that got more than ``INSTANT``, or may have behind steps."""
-    found = []
+    parts = []
     for grip, energy in zip(report.hands or ("",), report.hand_energies, strict=True):
         at = f" at {grip!r}" if grip else ""
         if energy.net > INSTANT:
-            found.append(f"net to the hand{at} {energy.sentence}")
+            parts.append(f"net to the hand{at} {energy.sentence}")
         elif energy.release:
-            found.append(f"the scene's storage{at} {energy.release}")
+            parts.append(f"the scene's storage{at} {energy.release}")
         if energy.blur:
-            found.append(f"encoder steps{at} {energy.blur}")
-    return "; ".join(found)
+            parts.append(f"encoder steps{at} {energy.blur}")
+    return "; ".join(parts)
 
 
 @dataclass(slots=True, kw_only=True)

@@ -81,44 +81,44 @@ def print_unreadable(table: Table) -> None:
             print_error(reason)
 
 
-def print_what_if(found: WhatIf) -> None:
+def print_what_if(what_if: WhatIf) -> None:
     """Prints what was changed, the runs side by side, and what to know of them."""
-    for name, before, after in changes(found):
+    for name, before, after in changes(what_if):
         out.print(plain(f"{name}: {before} -> {after}"))
-    _print_runs(found)
-    for run in found.runs[1:]:
+    _print_runs(what_if)
+    for run in what_if.runs[1:]:
         out.print(f"{run.name}: {RUN_WORDS[run.name]}")
         for text in (*sentences(run), *run.report.conditions):
             out.print(f"  {plain(text)}")
-    for note in found.notes:
+    for note in what_if.notes:
         err.print(f"note: {plain(note)}")
 
 
-def print_alternatives(found: Sequence[WhatIf]) -> None:
+def print_alternatives(alternatives: Sequence[WhatIf]) -> None:
     """Prints the recorded run beside one run of each change, and what to know of them.
 
     It is the closed loop where there is one, else the run with the prescribed motion.
     """
-    kind = found[0].runs[-1].name
-    runs = [found[0].runs[0]]
-    for each in found:
+    kind = alternatives[0].runs[-1].name
+    runs = [alternatives[0].runs[0]]
+    for each in alternatives:
         changed = ", ".join(f"{name} {after}" for name, _, after in changes(each))
         runs.append(replace(each.runs[-1], name=changed))
-    _print_runs(replace(found[0], runs=tuple(runs)))
+    _print_runs(replace(alternatives[0], runs=tuple(runs)))
     out.print(f"each column: {RUN_WORDS[kind]}")
     for run in runs[1:]:
         for text in sentences(run):
             out.print(f"  {plain(f'{run.name}: {text}')}")
-    for note in dict.fromkeys(note for each in found for note in each.notes):
+    for note in dict.fromkeys(note for each in alternatives for note in each.notes):
         err.print(f"note: {plain(note)}")
 
 
-def _print_runs(found: WhatIf) -> None:
+def _print_runs(what_if: WhatIf) -> None:
     table = TextTable(box=None, pad_edge=False)
-    table.add_column(plain(found.path.name))
-    for run in found.runs:
+    table.add_column(plain(what_if.path.name))
+    for run in what_if.runs:
         table.add_column(plain(run.name))
-    for name, texts in rows(found):
+    for name, texts in rows(what_if):
         table.add_row(name, *map(plain, texts))
     out.print(table)
 
@@ -389,6 +389,6 @@ class Repair:
         """Repairs; returns the exit code."""
         with err.status(f"repairing {plain(str(self.file))} …"):
             mended = repair(self.file, self.output)
-        found = f"{len(mended.ticks)} ticks, {len(mended.events)} events"
-        out.print(f"wrote {plain(str(self.output))}: {found}")
+        contents = f"{len(mended.ticks)} ticks, {len(mended.events)} events"
+        out.print(f"wrote {plain(str(self.output))}: {contents}")
         return 0

@@ -217,8 +217,8 @@ def _print_diagnosis(diagnosis: Diagnosis) -> None:
         table.add_column(heading, justify="left" if heading.startswith("late") else "right")
     for name, late in diagnosis.lateness.items():
         numbers = (late.median, late.p99, late.p999, late.worst)
-        share = f"{late.missed} of {late.ticks + late.missed}"
-        table.add_row(name, *(f"{value * 1e6:.0f}" for value in numbers), share)
+        missed = f"{late.missed} of {late.ticks + late.missed}"
+        table.add_row(name, *(f"{value * 1e6:.0f}" for value in numbers), missed)
     out.print(table)
     for finding in diagnosis.findings:
         out.print(f"{_MARKS[finding.is_good]}  {finding.name}: {plain(finding.sentence)}")

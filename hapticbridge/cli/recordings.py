@@ -261,37 +261,37 @@ class Compare:
         return 0 if comparison.is_same else 1
 
 
-def _print(found: Comparison) -> None:
-    if found.is_same:
-        out.print(f"the same run: {found.compared} ticks are equal in every bit")
-    elif found.first is None:
-        out.print(f"{found.compared} common ticks are equal in every bit")
+def _print(comparison: Comparison) -> None:
+    if comparison.is_same:
+        out.print(f"the same run: {comparison.compared} ticks are equal in every bit")
+    elif comparison.first is None:
+        out.print(f"{comparison.compared} common ticks are equal in every bit")
     else:
-        first = found.first
+        first = comparison.first
         out.print(
             f"they part at tick {_ticks(first)} ({first.time:.6g} s) in {first.column}, by "
             f"{_size(first)}: {first.values[0]!r} and {first.values[1]!r}"
         )
-    if found.periods[0] != found.periods[1]:
-        rates = " and ".join(f"{1 / period:g} Hz" for period in found.periods)
-        out.print(f"rates {rates}: compared at their {found.compared} common ticks")
-    if found.ticks[0] != found.ticks[1]:
-        out.print(f"{found.ticks[0]} and {found.ticks[1]} ticks long")
-    if any(found.alone):
+    if comparison.periods[0] != comparison.periods[1]:
+        rates = " and ".join(f"{1 / period:g} Hz" for period in comparison.periods)
+        out.print(f"rates {rates}: compared at their {comparison.compared} common ticks")
+    if comparison.ticks[0] != comparison.ticks[1]:
+        out.print(f"{comparison.ticks[0]} and {comparison.ticks[1]} ticks long")
+    if any(comparison.alone):
         out.print(
-            f"ticks without a partner: {found.alone[0]} of the first, {found.alone[1]} of "
-            "the second"
+            f"ticks without a partner: {comparison.alone[0]} of the first, "
+            f"{comparison.alone[1]} of the second"
         )
-    for name, pair in found.decisive.items():
+    for name, pair in comparison.decisive.items():
         out.print(f"  {name}: {_shortened(pair[0])} and {_shortened(pair[1])}")
-    for name, counts in found.events.items():
+    for name, counts in comparison.events.items():
         other = ", which say other things" if counts[0] == counts[1] else ""
         out.print(f"  events '{plain(name)}': {counts[0]} and {counts[1]}{other}")
-    if found.largest:
+    if comparison.largest:
         out.print("largest difference per field:")
-        for each in found.largest:
+        for each in comparison.largest:
             out.print(f"  {each.column:24} {_size(each):>12} at tick {_ticks(each)}")
-        for name, pair in found.beside.items():
+        for name, pair in comparison.beside.items():
             out.print(f"  may explain it: {name} {_shortened(pair[0])} and {_shortened(pair[1])}")
 
 

@@ -393,19 +393,19 @@ def _remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
     parts += ("period",) if is_rate_free and loop.lag == IN_TIME else ()
     share = {part: _largest(partial(_bears, loop, axis, available, part)) for part in parts}
     stiffness, damping = _gains(_requested(loop), axis)
-    found = []
+    remedies = []
     if share["stiffness"]:
         limit = _three_digits(share["stiffness"] * stiffness)
-        found.append(f"lower the {prefix}stiffness to {limit} {spring}")
+        remedies.append(f"lower the {prefix}stiffness to {limit} {spring}")
     if share["damping"]:
         limit = _three_digits(share["damping"] * damping)
-        found.append(f"lower the {prefix}damping to {limit} {damper}")
+        remedies.append(f"lower the {prefix}damping to {limit} {damper}")
     if share.get("period", 0.0) * FASTEST * loop.period > 1:
         limit = _three_digits(1 / (share["period"] * loop.period), math.ceil)
-        found.append(f"raise the rate to {limit} Hz")
-    if not found:
+        remedies.append(f"raise the rate to {limit} Hz")
+    if not remedies:
         return _both_lowered(loop, axis, NEEDED_SHARE * available / loop.needed(axis))
-    told = ", or ".join(found)
+    told = ", or ".join(remedies)
     if _is_hidden(loop, axis):
         added = loop.method.compensated_share * share["stiffness"] * stiffness * loop.h
         at_most = _three_digits(added)
@@ -446,11 +446,11 @@ def _is_hidden(loop: LoopSetting, axis: Axis) -> bool:
 
 def _requested(loop: LoopSetting) -> Coupling:
     """Returns the smallest requested coupling of this law; hidden damping counts as 0."""
-    found = loop.requested(loop.law)
+    requested = loop.requested(loop.law)
     return replace(
-        found,
-        damping=0.0 if _is_hidden(loop, "translation") else found.damping,
-        rotational_damping=0.0 if _is_hidden(loop, "rotation") else found.rotational_damping,
+        requested,
+        damping=0.0 if _is_hidden(loop, "translation") else requested.damping,
+        rotational_damping=0.0 if _is_hidden(loop, "rotation") else requested.rotational_damping,
     )
 
 

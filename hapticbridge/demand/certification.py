@@ -235,11 +235,11 @@ def certification_of(
     )
 
 
-def worst_certification(found: Sequence[Certification]) -> Certification:
+def worst_certification(certifications: Sequence[Certification]) -> Certification:
     """Returns that of the hand that decides: not certified, then not judged, then with a limit."""
     ranks = {True: 0, None: 1, False: 2}
     return max(
-        found,
+        certifications,
         key=lambda each: (
             ranks[each.verdict],
             each.energy.unpaid if each.energy.fault else 0.0,

@@ -283,14 +283,14 @@ class Timekeeping:
     @property
     def _shortfall(self) -> str:
         """Samples that came and that were due, with the rate that suits the device."""
-        found = (
+        counts = (
             f"{self.fresh * self.due_rate:.4g} of the {self.due_rate:.4g} new samples per second"
         )
-        found += " that the device states" if self.is_rate_stated else " that the loop reads"
+        counts += " that the device states" if self.is_rate_stated else " that the loop reads"
         if not self.sample_rate or self.slowness:
-            return found
+            return counts
         rate = f"{self.sample_rate:.4g}"
-        return f"{found} (--rate {rate}, or rate={rate} in its data sheet, suits it)"
+        return f"{counts} (--rate {rate}, or rate={rate} in its data sheet, suits it)"
 
     @property
     def remark(self) -> str:
@@ -351,20 +351,20 @@ class Timekeeping:
         failed = [(late, usual) for late, usual in pairs if late.holds is False]
         if failed:
             late_one, usual = failed[0]
-            found = (
+            reason = (
                 f"{at_times} {late_one.needed:.3g} {usual.unit} of damping in {usual.axis} "
                 f"({usual.needed:.3g} with every tick in time), and has {usual.available:.3g}"
             )
         else:
             is_behind = any(each.delay for each in self.in_time)
             givers = "late samples and forces" + ", and the scene behind the delay," * is_behind
-            found = (
+            reason = (
                 f"{givers} may have given the hand "
                 f"{format_si(self.delay_energy, 'J')}, more than {format_si(INSTANT, 'J')}"
             )
         if self.silence and self.share >= MANY_KEPT and not self.sample_rate:
-            return f"{NOT_KEPT}: {self.silence.sentence}; check its link and its power ({found})"
-        return f"{NOT_KEPT}: {found}{self.slowness or f'; try {self.remedy}'}"
+            return f"{NOT_KEPT}: {self.silence.sentence}; check its link and its power ({reason})"
+        return f"{NOT_KEPT}: {reason}{self.slowness or f'; try {self.remedy}'}"
 
 
 def _scene_speed(times: RunTimes, ticks: int) -> float:

@@ -421,49 +421,49 @@ def _width(fit: AxisFit) -> float:
 
 
 def _fitted(trace: Trace, length: float) -> AxisFit | None:
-    def found_at(delay: float) -> Windows | None:
-        found = windows(trace, length, delay)
-        is_usable = len(found.begin) >= MIN_WINDOWS and found.noise_share <= MAX_NOISE
-        return found if is_usable else None
+    def usable_at(delay: float) -> Windows | None:
+        usable = windows(trace, length, delay)
+        is_usable = len(usable.begin) >= MIN_WINDOWS and usable.noise_share <= MAX_NOISE
+        return usable if is_usable else None
 
-    delay, found = 0.0, found_at(0.0)
+    delay, usable = 0.0, usable_at(0.0)
     for _ in range(_ROUNDS):
-        if found is None:
+        if usable is None:
             return None
-        change = solved(found.columns, found.right)[_DELAY]
+        change = solved(usable.columns, usable.right)[_DELAY]
         before, delay = delay, float(np.clip(delay + change, 0.0, MAX_DELAY))
-        found = found_at(delay)
+        usable = usable_at(delay)
         if abs(delay - before) < 1e-9:
             break
-    if found is None:
+    if usable is None:
         return None
-    area = found.columns[0, _OFFSET]
-    speeds = found.columns[:, _DAMPING]
-    spring, drag = _last(2, [found.columns, found.position, found.drag], found.right)
-    law = [found.columns]
+    area = usable.columns[0, _OFFSET]
+    speeds = usable.columns[:, _DAMPING]
+    spring, drag = _last(2, [usable.columns, usable.position, usable.drag], usable.right)
+    law = [usable.columns]
     if spring.is_seen:
-        law.append(found.position)  # without it, a weak cable would reduce the fitted mass
+        law.append(usable.position)  # without it, a weak cable would reduce the fitted mass
     unbent, drag_speed = np.column_stack(law), 0.0
     if drag.is_seen:
         if drag.value < 0.0:
             drag_speed = float(np.abs(speeds).max()) / area
-        law.append(found.drag - drag_speed * speeds)
+        law.append(usable.drag - drag_speed * speeds)
     columns = np.column_stack(law)
-    values, error = solved(columns, found.right), half_widths(columns, found.right)
-    rest = (found.right - columns @ values) / area
-    trembling = float(values[_MASS]) * found.mass_noise / area
+    values, error = solved(columns, usable.right), half_widths(columns, usable.right)
+    rest = (usable.right - columns @ values) / area
+    trembling = float(values[_MASS]) * usable.mass_noise / area
 
-    applied = float(np.sqrt(np.mean((found.right / area) ** 2)))
+    applied = float(np.sqrt(np.mean((usable.right / area) ** 2)))
     # an underestimate of the mass attributes that share of the force to damping and friction
-    taken = found.noise_share * applied
+    taken = usable.noise_share * applied
     sums = (SUM_ERROR * applied + taken) / float(np.sqrt(np.mean((speeds / area) ** 2)))
     mass, damping, friction, offset = (float(value) for value in values[:_DELAY])
     return AxisFit(
-        mass=Estimate(mass, float(error[_MASS]) + (METHOD_ERROR + found.noise_share) * abs(mass)),
+        mass=Estimate(mass, float(error[_MASS]) + (METHOD_ERROR + usable.noise_share) * abs(mass)),
         damping=Estimate(
             damping,
             float(error[_DAMPING]) + METHOD_ERROR * abs(damping) + sums,
-            0.0 if drag.is_seen else _unseen(unbent, found, damping - float(error[_DAMPING])),
+            0.0 if drag.is_seen else _unseen(unbent, usable, damping - float(error[_DAMPING])),
         ),
         friction=Estimate(friction, float(error[_FRICTION]) + METHOD_ERROR * applied + taken),
         offset=Estimate(offset, float(error[_OFFSET])),
@@ -471,19 +471,19 @@ def _fitted(trace: Trace, length: float) -> AxisFit | None:
         spring=spring,
         drag=drag,
         drag_speed=drag_speed,
-        lost_gain=_last(1, [*law, found.excess], found.right)[0],
+        lost_gain=_last(1, [*law, usable.excess], usable.right)[0],
         unexplained=float(np.sqrt(max(np.mean(rest**2) - trembling**2, 0.0))),
         force=applied,
         window=length,
-        count=len(found.begin),
+        count=len(usable.begin),
     )
 
 
 def _last(count: int, columns: list[Array], right: Array) -> list[Estimate]:
     """Returns the factors of the last columns, which belong to effects beyond the ordinary law."""
     stacked = np.column_stack(columns)
-    found = zip(solved(stacked, right), half_widths(stacked, right), strict=True)
-    return [Estimate(float(value), float(half)) for value, half in found][-count:]
+    estimates = zip(solved(stacked, right), half_widths(stacked, right), strict=True)
+    return [Estimate(float(value), float(half)) for value, half in estimates][-count:]
 
 
 def _unseen(columns: Array, found: Windows, least: float) -> float:

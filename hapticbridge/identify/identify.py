@@ -499,10 +499,10 @@ def _draw_axis(panel: Axes, result: Identification, axis: str, fit: AxisFit) -> 
     turns = len(axis) == 2
     step = 0.0 if turns else result.resolution or 0.0
     trace = Trace(run.position, run.force, run.period, step, noise_of(run.position, step))
-    found = windows(trace, fit.window, fit.delay.value)
-    area = found.columns[:, 3]
-    speed = found.columns[:, 1] / area
-    rest = found.right / area - fit.mass.value * found.columns[:, 0] / area - fit.offset.value
+    windowed = windows(trace, fit.window, fit.delay.value)
+    area = windowed.columns[:, 3]
+    speed = windowed.columns[:, 1] / area
+    rest = windowed.right / area - fit.mass.value * windowed.columns[:, 0] / area - fit.offset.value
     panel.plot(speed, rest, ".", color=colour, ms=3, zorder=3)
     most = float(np.abs(speed).max())
     line = np.linspace(-most, most, 400)
@@ -583,18 +583,18 @@ def measured_profile(
     )
 
 
-def delay_of(found: Estimate, period: float) -> float:
+def delay_of(estimate: Estimate, period: float) -> float:
     """Returns a measured delay in s: as whole ticks if the interval has a whole number of them.
 
     A device that answers a request within the tick is a tick late. Its estimate is a little more or
     less than that, and a little more would count as another whole tick.
 
     Args:
-        found: The estimate in s.
+        estimate: The delay as estimated, in s.
         period: T in s of the loop that measured it.
     """
-    whole = max(round(found.value / period), 0) * period
-    return whole if found.least <= whole <= found.most else max(found.value, 0.0)
+    whole = max(round(estimate.value / period), 0) * period
+    return whole if estimate.least <= whole <= estimate.most else max(estimate.value, 0.0)
 
 
 def _quantity(found: Estimate, source: str) -> Quantity:

@@ -344,10 +344,10 @@ def _actuator_work(s: State) -> float:
 @compiled
 def has_loaded_body(s: State) -> bool:
     """Returns True if a wrench is applied to a body."""
-    found = 0
+    is_loaded = 0
     for value in floats(s.mj.xfrc_applied, 6 * s.mj.nbody):
-        found |= value != 0.0  # without a branch, so that several are compared at once
-    return found != 0
+        is_loaded |= value != 0.0  # without a branch, so that several are compared at once
+    return is_loaded != 0
 
 
 @compiled
@@ -366,20 +366,20 @@ def add_body_wrenches(s: State, result: int, clears: bool = False) -> bool:
         return False
     mj = s.mj
     wrenches = floats(mj.xfrc_applied, 6 * mj.nbody)
-    found = False
+    any_loaded = False
     for body in range(1, mj.nbody):
         is_loaded = False
         for i in range(6 * body, 6 * body + 6):
             is_loaded = is_loaded or wrenches[i] != 0.0
         if is_loaded:
-            if clears and not found:
+            if clears and not any_loaded:
                 floats(result, mj.nv)[:] = 0.0
-            found = True
+            any_loaded = True
             force = mj.xfrc_applied + 48 * body
             mj_apply_ft(
                 mj.model, mj.data, force, force + 24, mj.xipos + 24 * body, np.int32(body), result
             )
-    return found
+    return any_loaded
 
 
 @compiled

@@ -89,6 +89,7 @@ from hapticbridge.kernel.pose import (
 )
 from hapticbridge.kernel.springs import (
     add_rest,
+    apply_shares,
     begin_springs,
     bind_springs,
     carry_springs,
@@ -96,7 +97,6 @@ from hapticbridge.kernel.springs import (
     note_rest,
     note_solved,
     restore_springs,
-    share_springs,
 )
 
 _OWN_VECTORS = (
@@ -183,7 +183,7 @@ def write_tool_bias(s: State, velocity: int, result: int) -> None:
     nv = mj.nv
     dofs = ints(lossless.dofs_of_tree, lossless.dof_count)
     qvel, other, saved = floats(mj.qvel, nv), floats(velocity, nv), floats(mj.scratch, nv)
-    bias, kept, found = (
+    bias, kept, target = (
         floats(mj.qfrc_bias, nv),
         floats(mj.scratch + 8 * nv, nv),
         floats(result, nv),
@@ -197,7 +197,7 @@ def write_tool_bias(s: State, velocity: int, result: int) -> None:
     mj_rne(mj.model, mj.data, np.int32(0), mj.qfrc_bias)
     _exchange_awake(s)
     for dof in dofs:
-        qvel[dof], found[dof], bias[dof] = saved[dof], bias[dof], kept[dof]
+        qvel[dof], target[dof], bias[dof] = saved[dof], bias[dof], kept[dof]
 
 
 @compiled
@@ -494,7 +494,7 @@ def scan_contacts(s: State) -> bool:
     """
     mj = s.mj
     lossless = s.lossless
-    found = constrained = bool(lossless.is_never_free)
+    touches = constrained = bool(lossless.is_never_free)
     lossless.active_contacts = 0
     contacts = pointer_at(mj.contact)
     for c in range(ints(mj.ncon, 1)[0]):
@@ -504,16 +504,16 @@ def scan_contacts(s: State) -> bool:
         for geom in ints(contact + mj.contact_geoms, 2):
             # a flex is no geom
             if geom < 0 or ints(lossless.geom_in_tree, mj.ngeom)[geom] != 0:
-                found, constrained = True, constrained or is_active
+                touches, constrained = True, constrained or is_active
     count = ints(mj.nefc, 1)[0]
     kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
     for row in range(count):
         in_tree = ints(lossless.joint_in_tree, mj.njnt)
         is_joint = kinds[row] == LIMIT_JOINT and in_tree[ids[row]] != 0
         if is_joint or kinds[row] == LIMIT_TENDON:
-            found = constrained = True
+            touches = constrained = True
     lossless.is_constrained = constrained
-    return found
+    return touches
 
 
 # The tool's kinematic tree: all bodies that its grip can move through joints alone
@@ -763,7 +763,7 @@ def apply_carried(s: State) -> None:
         in_tree = ints(lossless.dof_in_tree, mj.nv)
         for i in range(mj.nv):
             applied[i] += 0.5 * in_tree[i] * (before[i] - after[i])
-        share_springs(s)
+        apply_shares(s)
     for i in range(mj.nv):
         last[i] = applied[i]
 

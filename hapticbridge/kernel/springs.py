@@ -124,7 +124,7 @@ def bind_springs(
 
 
 @compiled
-def share_springs(s: State) -> None:
+def apply_shares(s: State) -> None:
     """Leaves their shares in the model, before the position stage of a lossless step."""
     springs = s.springs
     if springs.count == 0 or springs.is_shared:

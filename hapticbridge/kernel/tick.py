@@ -386,11 +386,11 @@ def take_velocities(s: State) -> None:
 @compiled
 def is_sound(s: State) -> bool:
     """Returns True if MuJoCo's check at the start of a step would find nothing to reset."""
-    mj, found = s.mj, 0
+    mj, outside = s.mj, 0
     for values in (floats(mj.qpos, mj.nq), floats(mj.qvel, mj.nv)):
         for value in values:  # without a branch, so that several are compared at once
-            found |= not abs(value) < MAX_CONTROL  # also for a value that is not a number
-    return found == 0
+            outside |= not abs(value) < MAX_CONTROL  # also for a value that is not a number
+    return outside == 0
 
 
 @compiled
@@ -924,11 +924,13 @@ def end_scene_step(state: NDArray[np.void], row: NDArray[np.void], substep: int)
 
 
 @compiled
-def take_result(state: NDArray[np.void], scene: NDArray[np.void], given: NDArray[np.void]) -> None:
+def take_result(
+    state: NDArray[np.void], scene: NDArray[np.void], scene_sample: NDArray[np.void]
+) -> None:
     """Takes over the step that a slower scene has done, and gives it the present handle pose."""
     if state[0].shown.waits:
         take_over(state, scene)
-    hand_over(state, given)
+    hand_over(state, scene_sample)
 
 
 @compiled
@@ -947,14 +949,14 @@ def shown_tick(
         As ``whole_tick``.
     """
     state, scene = states
-    row, scene_row, given = own
+    row, scene_row, scene_sample = own
     if before_step(state, sample, row, 0, elapsed) != OK:
         return False
     waits = state[0].shown.waits
     if is_due or not waits:
-        if waits and not whole_tick(scene, given, scene_row, scene[0].run.period):
+        if waits and not whole_tick(scene, scene_sample, scene_row, scene[0].run.period):
             return False
-        take_result(state, scene, given)
+        take_result(state, scene, scene_sample)
     return after_step(state, row, 0) == OK
 
 

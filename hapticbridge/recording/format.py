@@ -62,10 +62,10 @@ def refuse_format(path: Path, meta: Mapping[str, str]) -> None:
     Raises:
         RecordingError: The metadata name another format, or none.
     """
-    found = meta.get(FORMAT_KEY, "unknown")
-    if found != FORMAT:
+    version = meta.get(FORMAT_KEY, "unknown")
+    if version != FORMAT:
         raise RecordingError(
-            f"{path} has the recording format {found!r:.20}; this version of hapticbridge reads "
+            f"{path} has the recording format {version!r:.20}; this version of hapticbridge reads "
             f"format '{FORMAT}': record the run again"
         )
 
@@ -84,18 +84,18 @@ def further_hands(meta: Mapping[str, str]) -> list[dict[str, str]]:
         RecordingError: They are not a list of texts by name, or of too many hands.
     """
     try:
-        found = read_json(meta.get(HANDS_KEY, "[]"))
+        hands = read_json(meta.get(HANDS_KEY, "[]"))
     except ValueError:
-        found = None
-    is_list = isinstance(found, list) and len(found) < MAX_HANDS
+        hands = None
+    is_list = isinstance(hands, list) and len(hands) < MAX_HANDS
     if not is_list or not all(
         isinstance(each, dict) and all(isinstance(value, str) for value in each.values())
-        for each in found
+        for each in hands
     ):
         raise RecordingError(
             f"metadata '{HANDS_KEY}' are not texts by name for at most {MAX_HANDS} hands"
         )
-    return list(found)
+    return list(hands)
 
 
 def tick_topic(hand: int) -> str:

@@ -156,9 +156,9 @@ class Contents:
         if topic in ros_messages.TOPICS:
             name, schema_encoding, text = self._schemas.get(schema_id, ("", "", b""))
             own_name, own_text = ros_messages.TOPICS[topic]
-            found = name, schema_encoding, encoding, layout.without_comments(text)
+            stored = name, schema_encoding, encoding, layout.without_comments(text)
             own = own_name, layout.TICK_SCHEMA_ENCODING, layout.TICK_ENCODING
-            if found != (*own, layout.without_comments(own_text)):
+            if stored != (*own, layout.without_comments(own_text)):
                 raise DamageError(f"its topic {topic} has another schema than '{own_name}'")
             self._topics[channel], self.has_messages = topic, True
         if topic in _HANDS and channel not in self._topics:
@@ -307,10 +307,10 @@ class RecordingFile:
     @property
     def cut_sentence(self) -> str:
         """Sentence if the run's end is or was missing in the file, else empty."""
-        found = [CUT] if self.is_cut else []
+        causes = [CUT] if self.is_cut else []
         names = {event.get("event") for event in self.events}
-        found += [words for name, words in CUTTING_EVENTS.items() if name in names]
-        return "; ".join(found)
+        causes += [words for name, words in CUTTING_EVENTS.items() if name in names]
+        return "; ".join(causes)
 
     def blocks(self, size: int | None = None) -> Iterator[NDArray[np.void]]:
         """Yields the records in order, in blocks of equal size (the last: shorter).
@@ -326,26 +326,26 @@ class RecordingFile:
             yield from (self.kept[start : start + size] for start in range(0, self.count, size))
             return
         runs: list[NDArray[np.void]] = []
-        found = held = 0
+        yielded = held = 0
 
         def take(run: NDArray[np.void], hand: int) -> None:
             nonlocal held
             if hand != self.hand:
                 return
             if self.has_several_hands and self.is_cut:  # it may hold more records of one hand
-                run = run[: self.count - found - held]
+                run = run[: self.count - yielded - held]
             runs.append(run)
             held += run.size  # a sum over all runs in every part would be quadratic
 
         for _ in _read_parts(self.path, take, keeps_events=False):
             while held >= size:
                 block, runs[:] = _split(runs, size)
-                found, held = found + size, held - size
+                yielded, held = yielded + size, held - size
                 yield block
         if runs:
-            found += held
+            yielded += held
             yield _join(runs)
-        if found != self.count:
+        if yielded != self.count:
             raise RecordingError(f"the recording {self.path} was changed while it was read")
 
 

@@ -225,14 +225,14 @@ class Messages:
             filled["/wrench_on_tool"]["wrench"] = _turned(
                 rows["wrench_on_tool"], rows["tool_quaternion"]
             )
-        found = {}
+        wholes = {}
         for topic, messages in filled.items():
             if topic != TF:
                 messages["stamp"] = stamps
             whole = np.empty(rows.size, [("time", "<u8"), ("payload", f"V{messages.itemsize}")])
             whole["time"], whole["payload"] = times, messages.view(whole["payload"].dtype)
-            found[topic] = whole
-        return found
+            wholes[topic] = whole
+        return wholes
 
     def of_event(self, payload: bytes, time_ns: int, name: object) -> tuple[int, bytes]:
         """Returns log time in ns and line of the log, as CDR, for an event.
@@ -265,12 +265,12 @@ def _ros_pose(rows: NDArray[np.void], frame: str) -> NDArray[np.float64]:
 
 def _by_axes(axes: NDArray[np.float64], wrench: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns wrenches, (n, 6), whose force and torque are turned by a matrix."""
-    found = np.empty_like(wrench)
+    turned = np.empty_like(wrench)
     for start in (0, 3):
         x, y, z = (wrench[:, start + k] for k in range(3))
         for k, (a, b, c) in enumerate(axes.tolist()):
-            found[:, start + k] = a * x + b * y + c * z
-    return found
+            turned[:, start + k] = a * x + b * y + c * z
+    return turned
 
 
 def _turned(wrench: NDArray[np.float64], quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -308,5 +308,5 @@ class Checksums:
 
     def differing(self, other: Checksums) -> list[str]:
         """Returns the topics whose messages differ from another's."""
-        pairs = {topic: (found, other._sums[topic]) for topic, found in self._sums.items()}
+        pairs = {topic: (own, other._sums[topic]) for topic, own in self._sums.items()}
         return [topic for topic, (a, b) in pairs.items() if a.digest() != b.digest()]

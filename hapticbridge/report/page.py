@@ -226,8 +226,8 @@ def balance_of(report: AuditReport) -> str:
 
 def percent(is_on: NDArray[np.bool_]) -> str:
     """Formats the share of ticks in which something was on; rare events are not rounded to 0 %."""
-    share = 100 * float(np.mean(is_on))
-    return f"{share:.2g}%" if share < 99.5 else f"{share:.0f}%"
+    percentage = 100 * float(np.mean(is_on))
+    return f"{percentage:.2g}%" if percentage < 99.5 else f"{percentage:.0f}%"
 
 
 def event_rows(events: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str, str]]:

@@ -266,12 +266,12 @@ def describe_machine() -> dict[str, str]:
     }
 
 
-def describe_hands(found: Sequence[Mapping[str, str]]) -> dict[str, str]:
+def describe_hands(metas: Sequence[Mapping[str, str]]) -> dict[str, str]:
     """Returns the recording's metadata from those of each hand; of one hand, just its own.
 
     The first hand's are those of the run; ``hands`` holds what differs in each other hand.
     """
-    first, *others = found
+    first, *others = metas
     if not others:
         return dict(first)
     differing = [

@@ -276,9 +276,9 @@ class SampledLoop:
             self.filter_time,
         )
         if self.mass is not None:
-            share = self.period**2 / (4 * self.mass * np.sin(theta / 2) ** 2)
+            compliance = self.period**2 / (4 * self.mass * np.sin(theta / 2) ** 2)
             lead = np.exp(1j * (1 - force_delay(self.integrator)) * theta)
-            transfer = transfer / (1 - share * transfer * lead)
+            transfer = transfer / (1 - compliance * transfer * lead)
         return np.asarray(transfer * np.exp(-1j * self.delay * theta), dtype=np.complex128)
 
     def damping_spectrum(self, frequency: ArrayLike) -> _Array:

@@ -335,9 +335,9 @@ def transmission_line_spectrum(
     turns = np.rint(phase / np.pi)
     is_pole = np.abs(phase - turns * np.pi) < 1e-12
     with np.errstate(divide="ignore"):
-        share = np.sin(theta) / np.tan(phase)
+        ratio = np.sin(theta) / np.tan(phase)
     at_pole = np.where(theta == np.pi, -2 / trip, np.inf)
-    return np.asarray(z * np.where(is_pole, at_pole, share))
+    return np.asarray(z * np.where(is_pole, at_pole, ratio))
 
 
 def transmission_line_stiffness(

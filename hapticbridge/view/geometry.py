@@ -218,9 +218,9 @@ class Tendons:
             groups[:] = 0
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
-        found = {int(piece.objid): piece for piece in self._drawn(data)}
-        self._shown = sorted(found)
-        first = [found[tendon] for tendon in self._shown]
+        drawn = {int(piece.objid): piece for piece in self._drawn(data)}
+        self._shown = sorted(drawn)
+        first = [drawn[tendon] for tendon in self._shown]
         self.widths = np.array([2.0 * piece.size[0] for piece in first])
         self.colours = np.array([piece.rgba for piece in first], np.float64).reshape(-1, 4)
 
@@ -230,12 +230,12 @@ class Tendons:
         Args:
             data: State after ``mj_kinematics``; its tendons are computed here.
         """
-        found: dict[int, list[Array]] = {tendon: [] for tendon in self._shown}
+        ends: dict[int, list[Array]] = {tendon: [] for tendon in self._shown}
         for piece in self._drawn(data) if self._shown else ():
             # a capsule along its third axis, from end to end
             half = piece.size[2] * piece.mat[:, 2]
-            found[int(piece.objid)].append(np.stack([piece.pos - half, piece.pos + half]))
-        return tuple(np.array(each, np.float32).reshape(-1, 2, 3) for each in found.values())
+            ends[int(piece.objid)].append(np.stack([piece.pos - half, piece.pos + half]))
+        return tuple(np.array(each, np.float32).reshape(-1, 2, 3) for each in ends.values())
 
     def _drawn(self, data: mujoco.MjData) -> list[mujoco.MjvGeom]:
         """Returns the geoms that MuJoCo would draw for tendons."""
@@ -372,14 +372,14 @@ def checked(array: Any, *shape: int | None) -> Array:
     Raises:
         ValueError: They have another shape, or are not finite.
     """
-    found = np.array(array, np.float64)  # a copy, which viser may keep
-    if len(shape) != found.ndim or any(
-        wanted not in (None, side) for wanted, side in zip(shape, found.shape, strict=True)
+    copied = np.array(array, np.float64)  # a copy, which viser may keep
+    if len(shape) != copied.ndim or any(
+        wanted not in (None, side) for wanted, side in zip(shape, copied.shape, strict=True)
     ):
-        raise ValueError(f"numbers have the shape {found.shape}, not {shape}")
-    if not np.isfinite(found).all():
+        raise ValueError(f"numbers have the shape {copied.shape}, not {shape}")
+    if not np.isfinite(copied).all():
         raise ValueError("a number is not finite")
-    return found
+    return copied
 
 
 def _surface(mesh: trimesh.Trimesh) -> list[NDArray[Any]]:

@@ -255,10 +255,6 @@ class Place:
         field = self.field
         return (min(max(value, field.minimum), field.maximum) & self.mask) << self.offset
 
-    def share(self, share: float) -> int:
-        """Returns the logical value at a share of the range, 0: smallest, 1: largest."""
-        return self.field.minimum + round(share * (self.field.maximum - self.field.minimum))
-
 
 class Layout:
     """All reports of a device, from its descriptor.

@@ -52,11 +52,11 @@ POSES: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
 """Poses of the handle, in m and as a rotation vector in rad: in, against a wall, tilted against two
 edges, onto the bottom. The last three are judged."""
 
-RAMP, HOLD = 0.2, 0.4
+RAMP, STAY = 0.2, 0.4
 """Times in s of a ramp and of a hold. The minimum-jerk ramp leaves little ringing. After the hold,
 with the damping of the chart, e⁻⁶ of it is left."""
 
-DURATION = len(POSES) * (RAMP + HOLD)
+DURATION = len(POSES) * (RAMP + STAY)
 
 JUDGED = tuple(range(1, len(POSES)))
 
@@ -76,17 +76,17 @@ def led(
         stops: Positions in m and rotation vectors in rad, shape (n, 6). The first is the start.
         times: Times in s.
     """
-    stage = np.minimum((times / (RAMP + HOLD)).astype(int), len(stops) - 2)
-    share = np.clip((times - stage * (RAMP + HOLD)) / RAMP, 0.0, 1.0)
+    stage = np.minimum((times / (RAMP + STAY)).astype(int), len(stops) - 2)
+    share = np.clip((times - stage * (RAMP + STAY)) / RAMP, 0.0, 1.0)
     smooth = share**3 * (10 - 15 * share + 6 * share**2)
     poses = stops[stage] + smooth[:, None] * (stops[stage + 1] - stops[stage])
     turns = Rotation.from_rotvec(poses[:, 3:]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
     return poses[:, :3] - stops[0, :3], turns
 
 
-def end_of_hold(index: int) -> float:
+def end_of_pose(index: int) -> float:
     """Returns the time in s at which the handle leaves a pose."""
-    return (index + 1) * (RAMP + HOLD)
+    return (index + 1) * (RAMP + STAY)
 
 
 HALF_WIDTH, HALF_LENGTH = 0.01, 0.03
@@ -314,7 +314,7 @@ def score_at_rest(reference: NDArray[np.void], holds: Sequence[int], take: Take)
     """
     if take.has_diverged:
         return diverged(take.created, take.ended)
-    ends = [round(end_of_hold(index) / take.setting.period) - 1 for index in holds]
+    ends = [round(end_of_pose(index) / take.setting.period) - 1 for index in holds]
     records = take.records[np.minimum(ends, take.records.size - 1)]
     force, exact = (
         np.linalg.norm(each["wrench_on_tool"][:, :3], axis=1) for each in (records, reference)

@@ -13,7 +13,7 @@ from hapticbridge.errors import StudyError
 from hapticbridge.kernel.pose import quaternion_exp
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import work_of
-from hapticbridge.lab.chart.peg import HOLD, RAMP, led, score_at_rest
+from hapticbridge.lab.chart.peg import RAMP, STAY, led, score_at_rest
 from hapticbridge.lab.chart.scene_run import Prepared, Staged, Stages
 from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
 from hapticbridge.lab.maps.base import scene_of
@@ -336,7 +336,7 @@ class HexSocket(Staged):
 
     def __init__(self, coupling: Coupling, grid: float, finest: float) -> None:
         self._reference, self._finest = turned_key(coupling), finest
-        self._duration = grid * math.ceil(len(TURNS) * (RAMP + HOLD) / grid)
+        self._duration = grid * math.ceil(len(TURNS) * (RAMP + STAY) / grid)
         super().__init__(
             coupling, Stages(lambda: Prepared(hex_scene(), turning, self._duration, coupling))
         )

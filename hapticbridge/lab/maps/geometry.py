@@ -237,15 +237,15 @@ def evaluate(point: Point) -> Mapping[str, float | int | str | bool]:
     )
     if point["what"] == "limit":
         if name == "direct":
-            found = base.largest_stable(
+            bracket = base.largest_stable(
                 lambda value: is_stable(name, value, stiffness), LENGTH[0] / 4, 4 * LENGTH[1]
             )
         else:
             lower, upper = ROTATIONAL_STIFFNESS
-            found = base.largest_stable(
+            bracket = base.largest_stable(
                 lambda value: is_stable(name, length, value), lower / 4, 4 * upper
             )
-        return {"limit": found.middle}
+        return {"limit": bracket.middle}
     outcome = run(name, length, stiffness)
     return {
         "stable": has_calmed(outcome, name, length, stiffness),

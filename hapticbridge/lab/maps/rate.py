@@ -365,13 +365,13 @@ def _draw_delays(axes: Axes, name: str, by_delay: Mapping[str, Any]) -> None:
     axes.grid(visible=True, which="both", alpha=0.25)
 
 
-def _draw_slow(axes: Axes, found: Mapping[str, Any]) -> None:
+def _draw_slow(axes: Axes, curves: Mapping[str, Any]) -> None:
     axes.set(xscale="log", yscale="log")
-    if found:
-        period = 1e3 * np.array(found["period"])
-        axes.plot(period, _drawable(found["measured"]), "D", color="black", mfc="white", ms=5)
-        axes.plot(period, found["at_loop"], "-", color=base.THEORY_COLOUR)
-        axes.plot(period, found["at_scene"], ":", color=base.THEORY_COLOUR)
+    if curves:
+        period = 1e3 * np.array(curves["period"])
+        axes.plot(period, _drawable(curves["measured"]), "D", color="black", mfc="white", ms=5)
+        axes.plot(period, curves["at_loop"], "-", color=base.THEORY_COLOUR)
+        axes.plot(period, curves["at_scene"], ":", color=base.THEORY_COLOUR)
     else:
         base.say_missing(axes)
     axes.set_xlabel("scene's period (ms)")
@@ -380,9 +380,9 @@ def _draw_slow(axes: Axes, found: Mapping[str, Any]) -> None:
     axes.grid(visible=True, which="both", alpha=0.25)
 
 
-def _draw_uneven(axes: Axes, found: Mapping[str, Any], words: str) -> None:
+def _draw_uneven(axes: Axes, curves: Mapping[str, Any], words: str) -> None:
     axes.set_yscale("log")
-    for name, selected in found.items():
+    for name, selected in curves.items():
         axes.plot(
             selected["share"],
             _drawable(selected["measured"]),
@@ -391,8 +391,8 @@ def _draw_uneven(axes: Axes, found: Mapping[str, Any], words: str) -> None:
             mfc="white",
             ms=5,
         )
-    if found:
-        lines = next(iter(found.values()))  # the ticks were equal for every hand
+    if curves:
+        lines = next(iter(curves.values()))  # the ticks were equal for every hand
         for key, (_, style) in STYLES.items():
             axes.plot(lines["share"], lines[key], style, color=base.THEORY_COLOUR)
     else:
@@ -424,19 +424,19 @@ def summarize(table: Table) -> dict[str, Any]:
 
 def _by_delay(name: str, table: Table) -> dict[str, Any]:
     rows = base.of_method(table, "delay", name)
-    found: dict[str, Any] = {}
+    curves: dict[str, Any] = {}
     for delay in np.unique(rows["delay"]):
         selected = rows.select(rows["delay"] == delay)
         period, limit = selected["period"], selected.numbers("limit")
         predicted = np.array([wall_limit(name, float(t), int(delay)) for t in period])
-        found[str(int(delay))] = {
+        curves[str(int(delay))] = {
             "period": period.tolist(),
             "measured": limit.tolist(),
             "predicted": predicted.tolist(),
             "worst_ratio_error": base.agreement(limit, predicted),
             "slope": _slope(period, limit),
         }
-    return found
+    return curves
 
 
 def _slope(period: NDArray[np.float64], limit: NDArray[np.float64]) -> float | None:
@@ -448,16 +448,16 @@ def _slope(period: NDArray[np.float64], limit: NDArray[np.float64]) -> float | N
 
 
 def _uneven(rows: Table) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    curves: dict[str, Any] = {}
     for name in HANDS:
         selected = rows.select(rows["hand"] == name)
         if len(selected):
-            found[name] = {
+            curves[name] = {
                 "share": selected["share"].tolist(),
                 "measured": selected.numbers("limit").tolist(),
                 **{f"at_{line}": uneven_bound(selected.numbers(line)).tolist() for line in LINES},
             }
-    return found
+    return curves
 
 
 def _slow(rows: Table) -> dict[str, Any]:

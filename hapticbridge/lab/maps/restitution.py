@@ -214,12 +214,12 @@ def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
     for axes, name in zip(panels[0], DRAWN, strict=True):
         _draw_curves(axes, table, name)
     panels[0, 0].set_ylabel("change of kinetic energy (J)")
-    found = by_setting.values()
-    distances = {law: [row["rms_distance_to_law"][law] for row in found] for law in COLOURS}
+    summaries = by_setting.values()
+    distances = {law: [row["rms_distance_to_law"][law] for row in summaries] for law in COLOURS}
     _draw_bars(panels[1, 0], by_setting, distances, "distance from MuJoCo, RMS (J)")
     largest = {
-        "MuJoCo": [row["largest_energy_change"] for row in found],
-        "newton": [row["largest_by_newton"] for row in found],
+        "MuJoCo": [row["largest_energy_change"] for row in summaries],
+        "newton": [row["largest_by_newton"] for row in summaries],
     }
     label = "largest change of energy (J)\nblack: MuJoCo, blue: Newton"
     _draw_bars(panels[1, 1], by_setting, largest, label)
@@ -312,14 +312,14 @@ def evaluate(point: Point) -> Mapping[str, float | int]:
     """
     name = str(point["setting"])
     angle, friction, slide = (float(point[key]) for key in ("angle", "friction", "slide"))
-    found = drop(name, angle, friction, slide)
+    impact = drop(name, angle, friction, slide)
     restitution = restitution_of(name)
     results: dict[str, float | int] = {
-        "energy_change": found.energy_change,
+        "energy_change": impact.energy_change,
         "restitution": restitution,
-        "own_restitution": found.velocity[1] / APPROACH,
-        "first_gain": found.first_gain,
-        "steps": found.steps,
+        "own_restitution": impact.velocity[1] / APPROACH,
+        "first_gain": impact.first_gain,
+        "steps": impact.steps,
         "inelastic": _by_law("poisson", angle, friction, slide, 0.0),
     }
     return results | {

@@ -336,18 +336,18 @@ def evaluate(point: Point) -> Mapping[str, float | int | str]:
     speed, angle = float(point["speed"]), float(point["angle"])
     coupling = coupling_of(stiffness)
     if point["what"] == "cut":
-        found = sudden(method, stiffness, speed)
+        motion = sudden(method, stiffness, speed)
     else:
-        found = spin(method, coupling, speed, angle=angle)
+        motion = spin(method, coupling, speed, angle=angle)
     return {
-        "ticks": found.ticks,
-        "environment": found.environment,
-        "created": found.created,
-        "slack_share": found.slack_share,
-        "first_active": found.first_active,
-        "largest_angle": found.largest_angle,
-        "crossed": found.crossed,
-        "torque_jump": found.torque_jump,
+        "ticks": motion.ticks,
+        "environment": motion.environment,
+        "created": motion.created,
+        "slack_share": motion.slack_share,
+        "first_active": motion.first_active,
+        "largest_angle": motion.largest_angle,
+        "crossed": motion.crossed,
+        "torque_jump": motion.torque_jump,
     }
 
 

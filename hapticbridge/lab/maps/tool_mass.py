@@ -309,11 +309,11 @@ def predicted_limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[st
 
 def _change(is_stable: Callable[[float], bool], width: float) -> Mapping[str, float | bool]:
     first, last = (is_stable(mass) for mass in MASS)
-    found = {"limit": float("nan"), "stable_if_light": first, "stable_if_heavy": last}
+    limits = {"limit": float("nan"), "stable_if_light": first, "stable_if_heavy": last}
     if first == last:
-        return found
+        return limits
     bracket = base.largest_stable(lambda mass: is_stable(mass) == first, *MASS, width)
-    return found | {"limit": bracket.middle}
+    return limits | {"limit": bracket.middle}
 
 
 def is_stable(cells: Table) -> NDArray[np.bool_]:

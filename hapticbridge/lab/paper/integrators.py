@@ -259,10 +259,10 @@ def _gains_of_four_rules(turns: Mapping[StepRule, Rotation]) -> Figure:
     particle.set_ylim(bottom=-45)
     particle.legend(fontsize="small", loc="lower left")
     for rule, turn in turns.items():
-        share = turn.kinetic_energy / turn.kinetic_energy[0] - 1
+        change = turn.kinetic_energy / turn.kinetic_energy[0] - 1
         body.plot(
-            PERIOD * np.arange(len(share)),
-            100 * share,
+            PERIOD * np.arange(len(change)),
+            100 * change,
             color=COLOURS[rule],
             label=NAMES[rule],
             # it lies upon the explicit one
@@ -480,11 +480,11 @@ def _swept(mass: float, delay: int) -> float:
     theta = np.linspace(1e-3, np.pi, 20_000)
     sine = np.sin(theta / 2)
     transfer = K + B / PERIOD * (1 - np.exp(-1j * theta))
-    share = PERIOD**2 / (4 * mass * sine**2)
+    compliance = PERIOD**2 / (4 * mass * sine**2)
     sign = (-np.sin(1.5 * theta) / sine, -1.0, 1.0)[delay]
     own = K * PERIOD / 2 - B * np.cos(theta)
-    top = own + sign * PERIOD / 2 * share * np.abs(transfer) ** 2
-    turned = 1 - share * transfer * np.exp(1j * (1 - delay) * theta)
+    top = own + sign * PERIOD / 2 * compliance * np.abs(transfer) ** 2
+    turned = 1 - compliance * transfer * np.exp(1j * (1 - delay) * theta)
     return float(np.max(top / np.abs(turned) ** 2))
 
 
