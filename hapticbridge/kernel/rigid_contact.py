@@ -403,8 +403,8 @@ def _note_blocked(s: State) -> None:
     s.contact.pressing = 0
     for c in range(ints(mj.ncon, 1)[0]):
         contact = contacts + c * mj.contact_size
-        row, dim = ints(contact + mj.contact_row, 1)[0], ints(contact + mj.contact_dim, 1)[0]
-        if 0 <= row <= MAX_ROWS - dim:
+        row = ints(contact + mj.contact_row, 1)[0]
+        if 0 <= row < MAX_ROWS:
             blocked[row] = _blocked_mobility(s, contact)
             s.contact.pressing += blocked[row] > 0.0
     for c in range(ints(mj.ncon, 1)[0] if s.contact.pressing else 0):
