@@ -112,11 +112,11 @@ def unpacked(text: bytes, data: bytes) -> Any:
     """
     start = 0
 
-    def array(found: dict[str, Any]) -> object:
+    def array(mapping: dict[str, Any]) -> object:
         nonlocal start
-        if _ARRAY not in found:
-            return found
-        kind, *shape = found[_ARRAY]
+        if _ARRAY not in mapping:
+            return mapping
+        kind, *shape = mapping[_ARRAY]
         if not all(type(side) is int and side >= 0 for side in shape):
             raise ValueError("the shape of an array is no shape")
         if kind == "bytes":
@@ -297,17 +297,17 @@ class Confined:
                     f"{self._what} gives more than {MAX_ANSWER >> 20} MB of results"
                 )
             try:
-                found = unpacked(self._read(size), self._read(rest))
+                result = unpacked(self._read(size), self._read(rest))
             except (ValueError, TypeError, RecursionError) as error:
                 raise ForeignSceneError(f"{self._what} gives a damaged result: {error}") from None
             if kind == _DONE:
-                return found
+                return result
             if kind == _REFUSED:
-                raise _refusal(found)
+                raise _refusal(result)
             if kind == _FAILED:
-                raise ForeignSceneError(f"{self._what} {found}")
+                raise ForeignSceneError(f"{self._what} {result}")
             if hear is not None:
-                hear(found)
+                hear(result)
         for _ in range(100):  # its end closed the pipe; if not, it is killed
             child, status = os.waitpid(self._child, os.WNOHANG)
             if child:
@@ -336,10 +336,10 @@ class Confined:
         return bytes(pieces)
 
 
-def _refusal(found: Any) -> HapticBridgeError:
+def _refusal(refusal: Any) -> HapticBridgeError:
     """Returns the error of the work; one of another class than these as a RecordingError."""
     classes = {each.__name__: each for each in (CouplingError, DeviceError, SceneError)}
-    name, words = found if isinstance(found, list) and len(found) == 2 else ("", found)
+    name, words = refusal if isinstance(refusal, list) and len(refusal) == 2 else ("", refusal)
     return classes.get(str(name), RecordingError)(str(words))
 
 
@@ -374,7 +374,7 @@ class _Limits:
         self.means: dict[str, bool] = {}
 
     def work_and_exit(self, work: Work, folder: str) -> None:
-        found: object = ""
+        words: object = ""
         is_refusal = False
         try:
             faulthandler.disable()
@@ -389,11 +389,11 @@ class _Limits:
             self._send(_DONE, work(self))
             os._exit(0)
         except BaseException as error:
-            found, is_refusal = failure(error)
-            found = [type(error).__name__, found] if is_refusal else found
+            words, is_refusal = failure(error)
+            words = [type(error).__name__, words] if is_refusal else words
         finally:
             with contextlib.suppress(BaseException):
-                self._send(_REFUSED if is_refusal else _FAILED, found)
+                self._send(_REFUSED if is_refusal else _FAILED, words)
             os._exit(1)
 
     def fail(self, words: str) -> None:
@@ -638,5 +638,5 @@ def means() -> dict[str, bool]:
     """Returns the means of this machine that confine a child, and if they work, by name."""
     if sys.platform == "win32":
         return {}
-    found: dict[str, bool] = in_bounds(lambda worker: worker.means, "the trial")
-    return found
+    trial: dict[str, bool] = in_bounds(lambda worker: worker.means, "the trial")
+    return trial

@@ -113,7 +113,7 @@ def checked_points(points: Iterable[Mapping[str, object]]) -> dict[str, Point]:
         StudyError: There is no point, a point is no mapping, repeats another one or has other
             parameters than the first, or a value is out of range. The message names the point.
     """
-    found: dict[str, Point] = {}
+    by_key: dict[str, Point] = {}
     names: list[str] = []
     for number, raw in enumerate(points):
         if not isinstance(raw, Mapping) or not raw:
@@ -130,22 +130,22 @@ def checked_points(points: Iterable[Mapping[str, object]]) -> dict[str, Point]:
             )
         if "error" in point:
             raise StudyError("no parameter may be named 'error': the sweep adds that column")
-        if point_key(point) in found:
+        if point_key(point) in by_key:
             raise StudyError(f"point {number} is there twice: {point!r:.200}")
-        found[point_key(point)] = point
-    if not found:
+        by_key[point_key(point)] = point
+    if not by_key:
         raise StudyError("there are no points; a sweep needs at least one")
-    return found
+    return by_key
 
 
 def _parameter(value: object, place: str) -> Value:
     try:
-        found = plain(value)
+        plain_value = plain(value)
     except ValueError as error:
         raise StudyError(f"{place}: {error}") from None
-    if isinstance(found, float) and not math.isfinite(found):
-        raise StudyError(f"{place} is {found}; it must be finite")
-    return found
+    if isinstance(plain_value, float) and not math.isfinite(plain_value):
+        raise StudyError(f"{place} is {plain_value}; it must be finite")
+    return plain_value
 
 
 # Results: the table of all points, and the file that keeps them between runs
@@ -362,10 +362,10 @@ class ResultFile:
 def _parsed(line: bytes) -> dict[str, Any]:
     """Returns the JSON object on a line, or an empty one if the line holds none."""
     try:
-        found = json.loads(line)
+        parsed = json.loads(line)
     except ValueError:
         return {}
-    return found if isinstance(found, dict) else {}
+    return parsed if isinstance(parsed, dict) else {}
 
 
 @cache

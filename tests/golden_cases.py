@@ -123,12 +123,21 @@ def machine() -> dict[str, str]:
 
 
 def _processor() -> str:
-    """Returns the instructions by which the mathematical libraries choose their code."""
-    try:
-        words = set(Path("/proc/cpuinfo").read_text(encoding="utf-8").split())
-    except OSError:
-        return platform.processor()
-    return " ".join(sorted(words & {"avx2", "avx512f", "fma"}))
+    """Returns a digest of numbers that the mathematical libraries compute on this processor.
+
+    OpenBLAS, NumPy and the C library choose their code by the processor at hand, each by other
+    instructions; so equal numbers are asked for, not equal names of instructions.
+    """
+    rng = np.random.default_rng(0)
+    computed: list[Any] = []
+    for size in (3, 6, 17, 64, 200):
+        matrix, vector = rng.standard_normal((size, size)), rng.standard_normal(size)
+        computed += [matrix @ matrix, matrix @ vector, vector @ vector, np.sum(vector)]
+        computed += [np.linalg.solve(matrix, vector), *np.linalg.svd(matrix)]
+        computed += [np.linalg.eigvals(matrix).view(float), np.linalg.cholesky(matrix @ matrix.T)]
+        computed += [each(np.abs(vector)) for each in (np.sin, np.exp, np.log, np.arctan, np.sqrt)]
+        computed += [[math.sin(x), math.exp(x), math.atan2(x, 0.3), abs(x) ** 0.7] for x in vector]
+    return digest(np.concatenate([np.ravel(each) for each in computed]))
 
 
 def json_text(content: Json) -> str:

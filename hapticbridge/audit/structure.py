@@ -118,16 +118,16 @@ def structure_fault(blocks: Iterable[NDArray[np.void]], events: RunEvents) -> Fa
     Impossible numbers come before times, times before flags, each at its earliest tick. No block
     may be empty.
     """
-    found: dict[int, Fault] = {}
+    earliest: dict[int, Fault] = {}
     before: NDArray[np.void] | None = None
     count = 0
     for ticks in blocks:
         before = ticks[:0] if before is None else before
         for rank, fault in enumerate(_faults(ticks, before, count, events)):
             if fault is not None:
-                found.setdefault(rank, fault)
+                earliest.setdefault(rank, fault)
         before, count = ticks[-1:], count + len(ticks)
-    return found[min(found)] if found else None
+    return earliest[min(earliest)] if earliest else None
 
 
 def _faults(

@@ -81,12 +81,12 @@ def clearances(
                 if float(away @ towards) < OPPOSITE:
                     both = (pair, other)
                     rooms[both] = max(rooms.get(both, 0.0), 0.5 * (distance + there))
-    found: dict[tuple[int, int], float] = {}
+    room_of: dict[tuple[int, int], float] = {}
     for both, room in rooms.items():
         for pair in both:
             if room > 0.0:
-                found[pair] = min(found.get(pair, np.inf), room)
-    return found
+                room_of[pair] = min(room_of.get(pair, np.inf), room)
+    return room_of
 
 
 def may_be_near(

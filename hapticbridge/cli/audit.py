@@ -283,29 +283,29 @@ class Audit:
         if len(asked) > 1 and (self.plot or self.report):
             raise RecordingError("--plot and --report show one change; give one value of each")
         with progress("simulating the changed runs") as show:
-            found, *others = what_ifs(
+            first, *others = what_ifs(
                 file, asked, strict=self.strict, in_process=self.in_process, progress=show
             )
         if others:
-            every = [found, *others]
+            every = [first, *others]
             if self.as_json:
                 out.print_json(json.dumps([json.loads(each.to_json()) for each in every]))
             else:
                 print_alternatives(every)
             return max(each.exit_code for each in every)
         if self.as_json:
-            out.print_json(found.to_json())
+            out.print_json(first.to_json())
         else:
-            print_what_if(found)
+            print_what_if(first)
         if self.plot is not None:
-            draw_what_if(found, self.plot)
+            draw_what_if(first, self.plot)
         if self.report is not None:
-            before = found.runs[0]
+            before = first.runs[0]
             with working("drawing"):
                 scene = self._scene_picture(before.recording, before.report)
-                write_what_if(found, self.report, scene)
+                write_what_if(first, self.report, scene)
         print_written(self.plot, self.report)
-        return found.exit_code
+        return first.exit_code
 
     def _draw(self, report: AuditReport) -> None:
         recording, *others = read_hands(report.path)

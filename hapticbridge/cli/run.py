@@ -67,10 +67,10 @@ if TYPE_CHECKING:
     from hapticbridge.view import Window
 
 
-def announce(setup: RunSetup, given: Mapping[str, float], *, is_method_chosen: bool) -> None:
+def announce(setup: RunSetup, named: Mapping[str, float], *, is_method_chosen: bool) -> None:
     """Prints the coupling and the device conditions that do not hold.
 
-    ``given`` has the gains of the coupling that the user named, ``is_method_chosen`` is true if
+    ``named`` has the gains of the coupling that the user named, ``is_method_chosen`` is true if
     they named the method.
     """
     method = setup.method
@@ -102,7 +102,7 @@ def announce(setup: RunSetup, given: Mapping[str, float], *, is_method_chosen: b
         err.print(f"[yellow]warning:[/yellow] {escape(method.hazard)}")
     if setup.scene_ticks:
         _announce_slow(setup)
-    _announce_damping(setup, given)
+    _announce_damping(setup, named)
     _announce_own_rate(setup)
     for sentence in _without_motor(setup):
         err.print(f"  {sentence}")
@@ -119,16 +119,16 @@ def announce(setup: RunSetup, given: Mapping[str, float], *, is_method_chosen: b
             err.print(f"[yellow]warning:[/yellow] {condition.sentence()}")
 
 
-def _announce_damping(setup: RunSetup, given: Mapping[str, float]) -> None:
+def _announce_damping(setup: RunSetup, named: Mapping[str, float]) -> None:
     """Says where the user named less damping than the method can render."""
     for symbol, name, unit in (
         ("B", "damping", "N s/m"),
         ("B_r", "rotational_damping", "N m s/rad"),
     ):
         least = getattr(setup.attainable, name)
-        if name in given and given[name] < least * (1.0 - 1e-9):
+        if name in named and named[name] < least * (1.0 - 1e-9):
             err.print(
-                f"  requested {symbol} = {given[name]:g} {unit}: method {setup.method.name} has "
+                f"  requested {symbol} = {named[name]:g} {unit}: method {setup.method.name} has "
                 f"at least {least:.4g} at this stiffness and rate"
             )
 

@@ -92,18 +92,18 @@ def driver_named(name: str) -> Driver | None:
         return None
     package = entry.dist.name if entry.dist is not None else entry.module
     try:
-        found = entry.load()
+        driver_of_package = entry.load()
     except (Exception, SystemExit) as error:
         raise DeviceError(
             f"the device '{name}' of the package {package} cannot be imported: "
             f"{type(error).__name__}: {error}"
         ) from error
-    if not isinstance(found, Driver) or found.name != name:
+    if not isinstance(driver_of_package, Driver) or driver_of_package.name != name:
         raise DeviceError(
             f"the package {package} names {entry.value} as the device '{name}'; it must be a "
             "hapticbridge.device.driver.Driver of that name"
         )
-    return _with_device_errors(found, package)
+    return _with_device_errors(driver_of_package, package)
 
 
 def _with_device_errors(driver: Driver, package: str) -> Driver:

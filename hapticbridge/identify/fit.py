@@ -486,8 +486,8 @@ def _last(count: int, columns: list[Array], right: Array) -> list[Estimate]:
     return [Estimate(float(value), float(half)) for value, half in estimates][-count:]
 
 
-def _unseen(columns: Array, found: Windows, least: float) -> float:
+def _unseen(columns: Array, windows: Windows, least: float) -> float:
     """Returns the additional lower width of b due to a drag too small to be significant."""
-    bent = np.column_stack([columns, found.drag])
-    value = solved(bent, found.right)[_DAMPING] - half_widths(bent, found.right)[_DAMPING]
+    bent = np.column_stack([columns, windows.drag])
+    value = solved(bent, windows.right)[_DAMPING] - half_widths(bent, windows.right)[_DAMPING]
     return max(least - float(value), 0.0)

@@ -552,15 +552,15 @@ def measured_profile(
     source = f"identified on {date}: {duration:g} s per axis ({', '.join(result.fits)}); {UNHELD}"
     quantities: dict[str, Quantity] = {}
     for name, (field, turns) in _FIELDS.items():
-        found = result.of_all(field, turns=turns)
-        if found is not None:
-            quantities[name] = _quantity(found, source)
+        estimate = result.of_all(field, turns=turns)
+        if estimate is not None:
+            quantities[name] = _quantity(estimate, source)
     if result.resolution is not None:
         quantities["resolution"] = Quantity(result.resolution, source)
     late = [
-        found
+        estimate
         for turns in (False, True)
-        if (found := result.of_all("delay", turns=turns, most=True)) is not None
+        if (estimate := result.of_all("delay", turns=turns, most=True)) is not None
     ]
     latest = max(late, key=lambda delay: delay.most)
     quantities["delay"] = replace(
@@ -597,7 +597,8 @@ def delay_of(estimate: Estimate, period: float) -> float:
     return whole if estimate.least <= whole <= estimate.most else max(estimate.value, 0.0)
 
 
-def _quantity(found: Estimate, source: str) -> Quantity:
+def _quantity(estimate: Estimate, source: str) -> Quantity:
     # friction and delay are not negative, but a measurement of zero may be
-    value = max(found.value, 0.0)
-    return Quantity(value, source, (min(max(found.least, 0.0), value), max(found.most, value)))
+    value = max(estimate.value, 0.0)
+    interval = min(max(estimate.least, 0.0), value), max(estimate.most, value)
+    return Quantity(value, source, interval)

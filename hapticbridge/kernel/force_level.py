@@ -65,7 +65,7 @@ LEVEL_DTYPE = np.dtype(
         ("tried", "<f8", 2),
         ("length", "<f8", 2),
         ("wanted", "<f8", 2),
-        ("found", "<f8", 2),
+        ("new_length", "<f8", 2),
         ("is_solved", "<i8"),
         ("reads_poses", "<i8"),
         ("repetitions", "<i8"),
@@ -76,7 +76,7 @@ LEVEL_DTYPE = np.dtype(
 """Sub-record ``level``, written by this module alone. Pairs are force and torque: ``level`` F on
 the tool in N and N m, ``gain_ratio`` c of the present gains, ``previous`` c of the previous tick,
 ``compliance`` σ; ``tried`` c of the previous repetition in the step and ``length`` its ‖u‖;
-``wanted`` c of the next repetition and ``found`` the present ‖u‖.
+``wanted`` c of the next repetition and ``new_length`` the present ‖u‖.
 ``is_solved`` is 1 if steps are repeated, and ``reads_poses`` if sensors, plugins or a callback read
 the bodies' poses then; ``repetitions`` counts repetitions since the start; ``state_before`` is the
 address of MuJoCo's state before the step."""
@@ -167,7 +167,7 @@ def limited_wrench(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vec
 
 @compiled
 def _is_at_level(s: State, count: int) -> bool:
-    """Returns True if the wrench is at its level or below; else notes the shares to try.
+    """Returns True if the wrench is at its level or below; else notes the ratios to try.
 
     ``count`` is the number of repetitions of the step so far.
     """
@@ -177,7 +177,7 @@ def _is_at_level(s: State, count: int) -> bool:
     is_done = True
     for ch in range(2):
         c, size = level.gain_ratio[ch], sizes[ch]
-        u = level.found[ch] = size / c
+        u = level.new_length[ch] = size / c
         if count > 0 and c != level.tried[ch]:
             u_last = level.length[ch]
             change = level.tried[ch] * u_last - size
@@ -194,16 +194,16 @@ def _is_at_level(s: State, count: int) -> bool:
 
 @compiled
 def _can_try(level: Part) -> bool:
-    """Returns True if the shares to try are numbers."""
+    """Returns True if the ratios to try are numbers."""
     return math.isfinite(level.wanted[0] + level.wanted[1])
 
 
 @compiled
-def _try_shares(s: State) -> None:
-    """Sets the shares of the step's repetition."""
+def _try_ratios(s: State) -> None:
+    """Sets the ratios of the step's repetition."""
     level = s.level
     for ch in range(2):
-        level.length[ch] = level.found[ch]
+        level.length[ch] = level.new_length[ch]
         level.tried[ch], level.gain_ratio[ch] = level.gain_ratio[ch], level.wanted[ch]
     set_gains(s, 1.0)
 
@@ -237,7 +237,7 @@ def _solve_levels(states: NDArray[np.void]) -> bool:
         if is_done or not can_try:
             break
         for i in range(states.size):
-            _try_shares(states[i])
+            _try_ratios(states[i])
         _start_again(first, count)
         count += 1
     first.level.repetitions += count
@@ -247,7 +247,7 @@ def _solve_levels(states: NDArray[np.void]) -> bool:
 
 
 @compiled
-def _foresee_shares(s: State) -> None:
+def _foresee_ratios(s: State) -> None:
     """Sets the gains of the next tick: 1/c goes on as in the last two ticks."""
     level = s.level
     is_changed = False
@@ -302,8 +302,8 @@ def limited_wrench_after_step(
     s = states[0]
     is_reduced = False
     for i in range(states.size):
-        share = states[i].level.gain_ratio
-        is_reduced = is_reduced or share[0] < 1.0 or share[1] < 1.0
+        ratio = states[i].level.gain_ratio
+        is_reduced = is_reduced or ratio[0] < 1.0 or ratio[1] < 1.0
     if is_reduced:  # the wrench of the step itself decides, without poses
         _solve_levels(states)
     mj_kinematics(s.mj.model, s.mj.data)
@@ -314,7 +314,7 @@ def limited_wrench_after_step(
                 mj_kinematics(s.mj.model, s.mj.data)
                 force, torque, motion = _law_after_step(s, is_last)
             for i in range(states.size):
-                _foresee_shares(states[i])
+                _foresee_ratios(states[i])
         force, torque = limited_wrench(s, force, torque)
     else:
         s.level.flags = 0

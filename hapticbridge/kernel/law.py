@@ -218,16 +218,16 @@ def limited(spring: Spring, u: Vector) -> Vector:
 
 
 @compiled
-def next_gain_ratio(spring: Spring, size: float, share: float, compliance: float) -> float:
+def next_gain_ratio(spring: Spring, size: float, ratio: float, compliance: float) -> float:
     """Returns c with c ‖u‖ = g(‖u‖) for ‖u‖ = A/(1 + c σ), at most 1.
 
     Args:
         spring: The spring.
         size: Force c ‖u‖ of the last solution.
-        share: Its c, above 0.
+        ratio: Its c, above 0.
         compliance: σ, without unit.
     """
-    a = size / share * (1.0 + share * compliance)
+    a = size / ratio * (1.0 + ratio * compliance)
     if a <= spring.level * (1.0 + compliance):
         return 1.0
     return spring.level / (a - spring.level * compliance)

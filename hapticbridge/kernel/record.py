@@ -297,10 +297,10 @@ class TableColumns:
 
     def values(self, ticks: NDArray[np.void]) -> list[NDArray[Any]]:
         """Returns the columns of some records, each contiguous, (n,), int64 or float64."""
-        found: list[NDArray[Any]] = [due_times(ticks, self._period)]
+        columns: list[NDArray[Any]] = [due_times(ticks, self._period)]
         for column in self._columns:
             field = ticks[column.field]
-            found.append(
+            columns.append(
                 np.ascontiguousarray(field if column.part is None else field[:, column.part])
             )
-        return found
+        return columns

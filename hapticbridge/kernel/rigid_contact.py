@@ -495,14 +495,14 @@ def _shift_rows(s: State) -> bool:
     velocities = floats(pointer_at(mj.efc_vel), count)
     positions = floats(pointer_at(mj.efc_pos), count)
     reference = floats(pointer_at(mj.efc_aref), count)
-    shifts, found = floats(contact.row_shifts, count), False
+    shifts, is_any_shifted = floats(contact.row_shifts, count), False
     for row in range(count):
         if kinds[row] == EQUALITY and ints(contact.eq_type, ids[row] + 1)[ids[row]] <= LAST_TURNING:
             wanted = 0.5 * (velocities[row] - positions[row] * _EXACT * h * _IMPEDANCE)
             shifts[row] = velocities[row] + h * reference[row] - wanted
-            found = True
-    contact.is_shifted = found
-    return found
+            is_any_shifted = True
+    contact.is_shifted = is_any_shifted
+    return is_any_shifted
 
 
 @compiled

@@ -62,16 +62,16 @@ class Part(JITCodeLibrary):  # type: ignore[misc]  # numba has no types
 
     def modules(self) -> list[Any]:
         """Returns the code of this part and of all that it calls, each once."""
-        found: dict[Any, None] = {self: None}
+        reached: dict[Any, None] = {self: None}
         left: list[Any] = [self]
         while left:
             for callee in getattr(left.pop(), "_linking_libraries", ()):
-                if callee not in found:
-                    found[callee] = None
+                if callee not in reached:
+                    reached[callee] = None
                     if isinstance(callee, Part):
                         left.append(callee)
         whole: list[Any] = []
-        for each in found:
+        for each in reached:
             whole += each._modules if isinstance(each, Part) else [each._get_module_for_linking()]
         return whole
 

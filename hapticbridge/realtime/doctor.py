@@ -512,7 +512,7 @@ def _baseline_finding(refused: str) -> Finding:
 
 
 def judged(
-    lateness: dict[str, Lateness], found: tuple[Finding, ...], rate: float
+    lateness: dict[str, Lateness], findings: tuple[Finding, ...], rate: float
 ) -> tuple[str, str]:
     """Returns the verdict and its sentence.
 
@@ -522,7 +522,7 @@ def judged(
     allowed = LATE_SHARE * period
     missed = bridge.missed / (bridge.ticks + bridge.missed)
     # earlier findings matter more; one remedy often serves two findings
-    remedies = dict.fromkeys(f.remedy for f in found if f.is_good is False and f.remedy)
+    remedies = dict.fromkeys(f.remedy for f in findings if f.is_good is False and f.remedy)
     advice = "; ".join(list(remedies)[:2])
     held = f"{rate:g} Hz"
     numbers = f"99.9 % of ticks within {bridge.p999 * 1e6:.0f} µs, {bridge.missed} missed"

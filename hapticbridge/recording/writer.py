@@ -208,8 +208,8 @@ def _fallocate() -> Callable[..., int] | None:
     libc = ctypes.CDLL(None, use_errno=True)
     for name in ("fallocate64", "fallocate"):  # not every C library has both
         if hasattr(libc, name):
-            found: Callable[..., int] = getattr(libc, name)
-            return found
+            function: Callable[..., int] = getattr(libc, name)
+            return function
     return None
 
 

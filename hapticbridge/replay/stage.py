@@ -77,14 +77,14 @@ def contacts_of(
     Contacts without a force are left out: MuJoCo also lists pairs within their geoms' gap. A tool
     without mass has none, because MuJoCo solves for no force there.
     """
-    found: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+    contacts: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
     wrench = np.zeros(6)
     for index in range(data.ncon if parameters.properties.has_tool_mass else 0):
         mujoco.mj_contactForce(model, data, index, wrench)
-        if wrench[:3].any() and len(found) < MAX_CONTACTS:
+        if wrench[:3].any() and len(contacts) < MAX_CONTACTS:
             frame = data.contact.frame[index].reshape(3, 3)
-            found.append((data.contact.pos[index].copy(), frame.T @ wrench[:3]))
-    return np.array(found, dtype=np.float64).reshape(len(found), 2, 3)
+            contacts.append((data.contact.pos[index].copy(), frame.T @ wrench[:3]))
+    return np.array(contacts, dtype=np.float64).reshape(len(contacts), 2, 3)
 
 
 def force_colour(force: float, reference: float) -> NDArray[np.float64]:

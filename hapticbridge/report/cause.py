@@ -96,12 +96,12 @@ def cause_at_device(evidence: Evidence, window: slice) -> Cause:
         return _method_cause(method)
     conditions = run_conditions(evidence.info, evidence.worst, method)
     failing = [condition for condition in conditions if condition.is_damped is False]
-    if found := _delay_cause(evidence, failing):
-        return found
+    if cause := _delay_cause(evidence, failing):
+        return cause
     if failing:
         return _overload_cause(evidence, failing)
-    if found := _timing_cause(evidence, window):
-        return found
+    if cause := _timing_cause(evidence, window):
+        return cause
     if counts := _quantisation_words(evidence, window):
         steps = [each.steps.remedy for each in conditions if each.steps is not None]
         usual = "take a finer encoder or more friction"

@@ -360,14 +360,14 @@ class Session:
             return [self.setup.holding(self.kernel.sample, effective)]
         for _ in range(2):
             pairs = zip(self._setups, self._samples(), strict=True)
-            found = [each.parameters(own, None) for each, own in pairs]
-            reasons = map(RunSetup.overload, self._setups, found)
+            parameters = [each.parameters(own, None) for each, own in pairs]
+            reasons = map(RunSetup.overload, self._setups, parameters)
             reason = next(filter(None, reasons), "")
             if not reason:
                 break
             self.setup.carry(reason)
             self._update_scenes()
-        return found
+        return parameters
 
     def _bind(self, resources: ExitStack) -> None:
         """Binds the kernel of all hands, or of one and the loop of a slower scene."""
@@ -395,13 +395,13 @@ class Session:
                 refuse_stretched_start(state, own, each.limits, grip)
 
     def _description(self) -> dict[str, str]:
-        found = [
+        of_hands = [
             self._request.description(each, self.hand_parameters[hand])
             | describe_start(self.kernel.state[hand : hand + 1])
             for hand, each in enumerate(self._setups)
         ]
         return {
-            **describe_hands(found),
+            **describe_hands(of_hands),
             **describe_scene(self.setup.scene),
             **describe_machine(),
             "request": to_json(self._request),
@@ -588,24 +588,24 @@ class Session:
             return Trip(TripCode.ZERO_FORCE, self.tick, detail=str(error))
         return None
 
-    def trip(self, found: Trip) -> SafetyTrip:
+    def trip(self, cause: Trip) -> SafetyTrip:
         """Records a trip; returns its exception, with the records of the last second and a remedy.
 
         The remedy is a note of the exception. Its message is the bare reason, as in the recording.
         """
-        self.stopped_by, self.last_trip = BY_TRIP, found
-        self.event("trip", **found.details())
+        self.stopped_by, self.last_trip = BY_TRIP, cause
+        self.event("trip", **cause.details())
         self._before_trip = self.stream.latest(1)  # the ring is closed before the summary
-        trip = SafetyTrip(found.sentence, self.stream.latest(round(1.0 / self.setup.period)))
+        trip = SafetyTrip(cause.sentence, self.stream.latest(round(1.0 / self.setup.period)))
         created = float(self.kernel.state["energy"]["environment_energy"][0])
         hands = enumerate(self.hand_parameters)
         energies = (hand_energy(self.kernel.state[i : i + 1], own) for i, own in hands)
         energy = max(energies, key=lambda each: each.net)
         model, data = self.setup.scene.model, self.setup.scene.data
-        pump = first_pump(model) if found.may_be_pumped else None
+        pump = first_pump(model) if cause.may_be_pumped else None
         if pump is not None:
             trip.add_note(f"{pump.words}; write {pump.change}")
-        elif remedy := found.remedy(energy, created, strongest_actuator(model, data)):
+        elif remedy := cause.remedy(energy, created, strongest_actuator(model, data)):
             trip.add_note(remedy)
         return trip
 

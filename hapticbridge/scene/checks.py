@@ -425,7 +425,7 @@ def overlaps(model: mujoco.MjModel, data: mujoco.MjData, depth: float) -> list[O
 
     ``data`` must be after MuJoCo's position stage. Each pair of geoms or flexes is listed once.
     """
-    found: dict[str, Overlap] = {}
+    by_words: dict[str, Overlap] = {}
     pairs = {frozenset(pair) for pair in zip(model.pair_geom1, model.pair_geom2, strict=True)}
     for contact in sorted(data.contact, key=lambda contact: float(contact.dist)):
         if contact.dist >= -depth:
@@ -435,8 +435,8 @@ def overlaps(model: mujoco.MjModel, data: mujoco.MjData, depth: float) -> list[O
         first, second = (int(model.geom_bodyid[geom]) if geom >= 0 else -1 for geom, _ in sides)
         is_explicit = frozenset(geom for geom, _ in sides) in pairs
         overlap = Overlap(-float(contact.dist), words, (first, second), is_explicit)
-        found.setdefault(words, overlap)
-    return list(found.values())
+        by_words.setdefault(words, overlap)
+    return list(by_words.values())
 
 
 def refuse_overlap(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:

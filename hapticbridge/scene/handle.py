@@ -458,12 +458,12 @@ def tied_trees(model: mujoco.MjModel, tree: int) -> list[int]:
         {int(model.body_treeid[body]) for body in _tied_bodies(model, i)} - {-1}
         for i in np.flatnonzero(model.eq_active0).tolist()
     ]
-    found: set[int] = set()
+    tied: set[int] = set()
     more = {tree}
-    while more - found:
-        found |= more
-        more = set().union(*(pair for pair in pairs if pair & found))
-    return sorted(found)
+    while more - tied:
+        tied |= more
+        more = set().union(*(pair for pair in pairs if pair & tied))
+    return sorted(tied)
 
 
 def hanging_loads(model: mujoco.MjModel, trees: Sequence[int]) -> list[str]:
@@ -473,7 +473,7 @@ def hanging_loads(model: mujoco.MjModel, trees: Sequence[int]) -> list[str]:
         model: The compiled scene.
         trees: Trees whose weight is carried.
     """
-    found: dict[str, None] = {}
+    names: dict[str, None] = {}
     for tendon in range(model.ntendon):
         pulls = model.tendon_limited[tendon] or np.any(model.tendon_stiffness[tendon])
         wraps = np.arange(model.tendon_num[tendon]) + model.tendon_adr[tendon]
@@ -482,8 +482,8 @@ def hanging_loads(model: mujoco.MjModel, trees: Sequence[int]) -> list[str]:
         at = model.body_treeid[bodies]
         if pulls and np.isin(at, trees).any():
             loads = bodies[~np.isin(at, [*trees, -1])].tolist()
-            found |= {model.body(i).name or str(i): None for i in loads}
-    return list(found)
+            names |= {model.body(i).name or str(i): None for i in loads}
+    return list(names)
 
 
 def _tied_bodies(model: mujoco.MjModel, equality: int) -> tuple[int, ...]:
@@ -569,15 +569,15 @@ def exclude_nested(
 
 def announce_overlaps(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[SceneChange, ...]:
     """Returns the change in the treatment of what overlaps at the start."""
-    if found := overlaps(model, data, NOTABLE_OVERLAP):
+    if overlapping := overlaps(model, data, NOTABLE_OVERLAP):
         words = (
-            f"start where {_listed(found)}: pushed out at once → held, and eased out with energy "
-            "that the scene has dissipated"
+            f"start where {_listed(overlapping)}: pushed out at once → held, and eased out with "
+            "energy that the scene has dissipated"
         )
         return (SceneChange(words, "start"),)
     return ()
 
 
-def _listed(found: list[Overlap]) -> str:
-    count = len(found) - 1
-    return str(found[0]) + (f" (and {count} more pair{'s' * (count > 1)})" if count else "")
+def _listed(overlapping: list[Overlap]) -> str:
+    count = len(overlapping) - 1
+    return str(overlapping[0]) + (f" (and {count} more pair{'s' * (count > 1)})" if count else "")

@@ -79,20 +79,20 @@ def collect_sources(path: Path, main: bytes | None = None) -> tuple[SourceFile, 
     Raises:
         SceneError: A name leads to a device, pipe or socket, or through a link out of the folder.
     """
-    found: dict[Path, Path] = {}
-    _find_files(path, found, main)
+    files: dict[Path, Path] = {}
+    _find_files(path, files, main)
     parameters = parameters_file(path)
     if main is None and parameters.is_file():
-        found.setdefault(_key(parameters), parameters)
+        files.setdefault(_key(parameters), parameters)
     root = path.absolute().parent
-    passed = [folder for file in found.values() for folder in _left_folders(file)]
-    while not all(file.is_relative_to(root) for file in (*found, *passed)) and root != root.parent:
+    passed = [folder for file in files.values() for folder in _left_folders(file)]
+    while not all(file.is_relative_to(root) for file in (*files, *passed)) and root != root.parent:
         root = root.parent
-    _refuse_links(found, root, path)
-    names = (file.relative_to(root if file.is_relative_to(root) else file.anchor) for file in found)
+    _refuse_links(files, root, path)
+    names = (file.relative_to(root if file.is_relative_to(root) else file.anchor) for file in files)
     return tuple(
         SourceFile(name.as_posix(), main if main and file is path else file.read_bytes())
-        for name, file in zip(names, found.values(), strict=True)
+        for name, file in zip(names, files.values(), strict=True)
     )
 
 
@@ -145,11 +145,11 @@ def read_elements(data: bytes) -> Iterator[Element]:
         yield Element(match[1], attributes, line)
 
 
-def _find_files(path: Path, found: dict[Path, Path], content: bytes | None = None) -> None:
+def _find_files(path: Path, files: dict[Path, Path], content: bytes | None = None) -> None:
     """Adds a model's file, its includes, its assets and the models that it attaches."""
-    if _key(path) in found:
+    if _key(path) in files:
         return
-    found[_key(path)] = path
+    files[_key(path)] = path
     elements = list(_expanded(path, path.parent, {path}, content))
     folders = _asset_folders([element for element, _ in elements])
     for element, namer in elements:
@@ -162,9 +162,9 @@ def _find_files(path: Path, found: dict[Path, Path], content: bytes | None = Non
             if file is None:
                 continue
             if element.tag == "model":
-                _find_files(file, found)
+                _find_files(file, files)
             else:
-                found.setdefault(_key(file), file)
+                files.setdefault(_key(file), file)
 
 
 def _key(path: Path) -> Path:
@@ -256,14 +256,14 @@ def _existing(candidates: Iterator[Path]) -> Path | None:
     return None
 
 
-def _refuse_links(found: dict[Path, Path], root: Path, main: Path) -> None:
+def _refuse_links(files: dict[Path, Path], root: Path, main: Path) -> None:
     """Refuses links that lead out of the scene's folder, its main file's own, and its repository.
 
     A recording contains all files, also those that a scene reaches through a link.
     """
     around = [each for each in main.absolute().parents if (each / ".git").exists()]
     homes = [each.resolve() for each in (root, *around[:1])] + [main.resolve().parent]
-    for place, file in found.items():
+    for place, file in files.items():
         target = file.resolve()
         if not any(target.is_relative_to(home) for home in homes):
             raise SceneError(

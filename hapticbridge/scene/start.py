@@ -156,15 +156,15 @@ def _without_forces(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjDat
 
 def _violations(model: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, int], float]:
     """Returns the largest violation in m or rad of each limit and equality constraint."""
-    found: dict[tuple[str, int], float] = {}
+    sizes: dict[tuple[str, int], float] = {}
     for kind, number, distance in zip(data.efc_type, data.efc_id, data.efc_pos, strict=True):
         row = _ROWS.get(int(kind), ""), int(number)
         is_equality = row[0] == "equality"
         if not row[0] or (is_equality and int(model.eq_type[number]) not in _KINDS):
             continue
         size = abs(float(distance)) if is_equality else max(-float(distance), 0.0)
-        found[row] = max(found.get(row, 0.0), size)
-    return found
+        sizes[row] = max(sizes.get(row, 0.0), size)
+    return sizes
 
 
 def _row_name(model: mujoco.MjModel, row: tuple[str, int]) -> str:

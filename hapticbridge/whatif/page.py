@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 Row = tuple[str, tuple[str, ...]]
 
 
-def rows(found: WhatIf) -> Iterator[Row]:
-    """Yields a name and a text per run, in the order of ``found.runs``."""
-    runs, reports = found.runs, [run.report for run in found.runs]
+def rows(what_if: WhatIf) -> Iterator[Row]:
+    """Yields a name and a text per run, in the order of its runs."""
+    runs, reports = what_if.runs, [run.report for run in what_if.runs]
     for hand, grip in enumerate(runs[0].report.hands or ("",)):
         of_hand = [_coupling(run, hand) for run in runs]
         for name in ("effective", "law", "requested"):
@@ -78,9 +78,9 @@ def _coupling(run: WhatIfRun, hand: int) -> RunCoupling | None:
     return recorded_coupling(run.recordings[hand]) if run.report.hands else run.report.coupling
 
 
-def changes(found: WhatIf) -> Iterator[tuple[str, str, str]]:
+def changes(what_if: WhatIf) -> Iterator[tuple[str, str, str]]:
     """Yields each change: name, and the value before and after with its unit."""
-    for name, unit, before, after in found.changes:
+    for name, unit, before, after in what_if.changes:
         yield (
             name,
             f"{_format_value(before)} {unit}".rstrip(),
@@ -109,7 +109,7 @@ _STYLES = (("#555555", "-", 2.2), ("#1a5fb4", "-", 1.1), ("#b3261e", "--", 1.1))
 """Colour, line and width in points of each run; the recorded one lies behind the others."""
 
 
-def figure_of(found: WhatIf, bins: int = PICTURE_BINS) -> Figure:
+def figure_of(what_if: WhatIf, bins: int = PICTURE_BINS) -> Figure:
     """Draws force, handle displacement, and the energies of both ports over time.
 
     The force is that on the hand; on the tool if the recorded motion was prescribed.
@@ -117,27 +117,27 @@ def figure_of(found: WhatIf, bins: int = PICTURE_BINS) -> Figure:
     Raises:
         RecordingError: A run holds a number that cannot be drawn.
     """
-    hands = found.runs[0].report.hands or ("",)
+    hands = what_if.runs[0].report.hands or ("",)
     figure = new_figure(8 if len(hands) == 1 else 5.5 * len(hands), 11)
     columns = figure.subplots(4, len(hands), sharex=True, squeeze=False).T
     for hand, (grip, panels) in enumerate(zip(hands, columns, strict=True)):
-        _draw_hand(found, hand, panels, bins)
+        _draw_hand(what_if, hand, panels, bins)
         if grip:
             panels[0].set_title(printable(grip), fontsize="small", loc="left", parse_math=False)
-    changed = ", ".join(f"{name} {old} → {new}" for name, old, new in changes(found))
-    title = f"{found.path.name}, what if {changed or 'nothing is changed'}"
+    changed = ", ".join(f"{name} {old} → {new}" for name, old, new in changes(what_if))
+    title = f"{what_if.path.name}, what if {changed or 'nothing is changed'}"
     figure.suptitle(printable(title), fontsize="medium", parse_math=False, wrap=True)
     return figure
 
 
-def _draw_hand(found: WhatIf, hand: int, panels: NDArray[np.object_], bins: int) -> None:
-    before = found.runs[0].recordings[hand]
+def _draw_hand(what_if: WhatIf, hand: int, panels: NDArray[np.object_], bins: int) -> None:
+    before = what_if.runs[0].recordings[hand]
     is_held = not is_motion_prescribed(before.meta)
     is_joint = Grip.from_text(before.meta.get("grip", "")).is_joint
     wrench = "wrench_on_device" if is_held else "wrench_on_tool"
     unit = 1.0 if is_joint else 1e3
     origin = before.ticks["handle_position"][0]
-    for run, (colour, line, width) in zip(found.runs, _STYLES, strict=False):
+    for run, (colour, line, width) in zip(what_if.runs, _STYLES, strict=False):
         ticks = run.recordings[hand].ticks
         if not len(ticks):
             continue
@@ -170,17 +170,17 @@ def _draw_hand(found: WhatIf, hand: int, panels: NDArray[np.object_], bins: int)
     finish(panels[0])
 
 
-def draw_what_if(found: WhatIf, path: Path) -> None:
+def draw_what_if(what_if: WhatIf, path: Path) -> None:
     """Writes ``figure_of`` to a picture file.
 
     Raises:
         RecordingError: It cannot be drawn.
         HapticBridgeError: The file's extension is no picture format, or it cannot be written.
     """
-    write_picture(figure_of(found), path)
+    write_picture(figure_of(what_if), path)
 
 
-def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None:
+def write_what_if(what_if: WhatIf, path: Path, scene: bytes | None = None) -> None:
     """Writes one self-contained HTML page of less than 1 MB, for any length of run.
 
     ``scene`` is a PNG picture of the recorded scene, or None. An existing file is replaced.
@@ -189,18 +189,18 @@ def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None
         RecordingError: The page cannot be written, or not under this name.
     """
     try:
-        drawn = inline_svg(figure_of(found, PAGE_BINS))
+        drawn = inline_svg(figure_of(what_if, PAGE_BINS))
     except RecordingError:  # a run that cannot be drawn still has a verdict
         drawn = ""
     write_page(
         path,
         "what_if.html",
-        name=found.path.name,
-        recording=str(found.path),
-        changes=list(changes(found)),
-        runs=[_run_facts(run) for run in found.runs],
-        rows=list(rows(found)),
-        notes=found.notes,
+        name=what_if.path.name,
+        recording=str(what_if.path),
+        changes=list(changes(what_if)),
+        runs=[_run_facts(run) for run in what_if.runs],
+        rows=list(rows(what_if)),
+        notes=what_if.notes,
         drawn=drawn,
         scene=scene and base64.b64encode(scene).decode(),
     )

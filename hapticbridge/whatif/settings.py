@@ -32,14 +32,14 @@ KEPT = {
 
 def _changeable() -> dict[str, tuple[Any, Field[Any]]]:
     """Returns class and field of each setting that may be changed, by the name of its flag."""
-    found: dict[str, tuple[Any, Field[Any]]] = {}
+    settings: dict[str, tuple[Any, Field[Any]]] = {}
     kinds: tuple[Any, ...] = (Coupling, BridgeOptions, Workspace, Limits)
     for kind in kinds:
         for each in fields(kind):
             name = (rule_of(each).flag or each.name).replace("-", "_")
             if name not in KEPT and types_of(kind)[each.name] not in kinds:
-                found[name] = kind, each
-    return found
+                settings[name] = kind, each
+    return settings
 
 
 CHANGEABLE = _changeable()

@@ -161,8 +161,8 @@ def what_if(
         RecordingError: The recording cannot be judged or simulated, or a change is unknown.
         HapticBridgeError: The changed bridge is refused; the message names the reason.
     """
-    (found,) = what_ifs(path, (changes,), strict=strict, in_process=in_process, progress=progress)
-    return found
+    (answer,) = what_ifs(path, (changes,), strict=strict, in_process=in_process, progress=progress)
+    return answer
 
 
 def what_ifs(

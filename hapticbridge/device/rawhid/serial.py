@@ -436,34 +436,34 @@ def open_serial(
 
 
 def _candidates(options: Mapping[str, object], ports: SystemPorts) -> list[FoundDevice]:
-    found = ports.found()
+    plugged_in = ports.found()
     if (path := options.get("port")) is not None:
         path = str(path)
         if Path(path).is_symlink():  # such as those of /dev/serial/by-id
             path = os.path.realpath(path)
-        listed = [port for port in found if port.path == path]
+        listed = [port for port in plugged_in if port.path == path]
         return listed or [
             FoundDevice(driver="serial", name=path, serial="", path=path, transport="serial")
         ]
     if (serial := options.get("serial")) is not None:
-        found = [port for port in found if port.serial == serial]
-    if not found:
+        plugged_in = [port for port in plugged_in if port.serial == serial]
+    if not plugged_in:
         of = "" if serial is None else f" of serial '{serial}'"
         raise DeviceError(
             f"no serial port{of} is plugged in on USB; name one that is not on USB: 'serial:PORT'"
         )
-    return found
+    return plugged_in
 
 
 def _first_answer(
-    found: Iterable[FoundDevice],
+    candidates: Iterable[FoundDevice],
     ports: SystemPorts,
     bauds: tuple[int, ...],
     notify: Notify,
     options: Mapping[str, object],
 ) -> tuple[FoundDevice, tuple[SerialLink, int]]:
     reasons = []
-    for plugged in found:
+    for plugged in candidates:
         notify(f"asking {plugged.path}")
         try:
             return plugged, connect(ports, plugged, bauds, HexLog.from_options(options))

@@ -353,8 +353,8 @@ def filled(places: Mapping[Place, int]) -> int:
     return bits
 
 
-def required(found: Place | None, name: str) -> Place:
+def required(place: Place | None, name: str) -> Place:
     """Returns the place; raises DeviceError with the name if it is None."""
-    if found is None:
+    if place is None:
         raise DeviceError(f"its reports lack {name}")
-    return found
+    return place

@@ -563,5 +563,5 @@ def summary_of(chart: Chart) -> dict[str, Any]:
         "panels": panels,
         "points": points,
     }
-    found: dict[str, Any] = finite_or_null(facts)
-    return found
+    plain: dict[str, Any] = finite_or_null(facts)
+    return plain

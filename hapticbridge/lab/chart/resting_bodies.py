@@ -121,8 +121,8 @@ def borne(down: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     joints = np.arange(BOXES)
     load = down[..., None] + (joints + 1) * BOX_MASS * GRAVITY
-    share = np.minimum(BOX_FRICTION, HALF_WIDTH / ((2 * joints + 1) * HALF_HEIGHT))
-    return np.asarray((load * share).min(axis=-1))
+    needed = np.minimum(BOX_FRICTION, HALF_WIDTH / ((2 * joints + 1) * HALF_HEIGHT))
+    return np.asarray((load * needed).min(axis=-1))
 
 
 def leaning_force(coupling: Coupling, times: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -247,10 +247,10 @@ def play(apothem: float = APOTHEM, clearance: float = CLEARANCE) -> float:
     Raises:
         StudyError: The hexagon turns freely.
     """
-    share = (apothem + clearance) * math.sqrt(3) / (2 * apothem)
-    if not share < 1:
+    cosine = (apothem + clearance) * math.sqrt(3) / (2 * apothem)
+    if not cosine < 1:
         raise StudyError(f"a hexagon with a gap of {clearance:g} m a side turns freely")
-    return math.pi / 6 - math.acos(share)
+    return math.pi / 6 - math.acos(cosine)
 
 
 def turned_key(coupling: Coupling) -> NDArray[np.void]:

@@ -318,18 +318,18 @@ class OwnReferences:
     ) -> None:
         self._stages, self._grid = stages, grid
         self._period, self._count = finest / refinement, round(duration / grid)
-        self._found: dict[str, OwnReference | None] = {}
+        self._references: dict[str, OwnReference | None] = {}
 
     def reference_of(self, method: Method) -> OwnReference | None:
         """Returns a method's reference; None if it diverges even at this step."""
-        if method.name not in self._found:
+        if method.name not in self._references:
             setting = Setting(method, self._period)
             stage = self._stages.for_method(setting)
             records = fine_records(stage, setting, self._grid, self._count)
-            self._found[method.name] = (
+            self._references[method.name] = (
                 None if records is None else OwnReference(records, self._period)
             )
-        return self._found[method.name]
+        return self._references[method.name]
 
     def score(self, take: Take) -> Score:
         """Compares the first part of a take with its method's reference."""
@@ -357,7 +357,7 @@ class OwnReferences:
         contacts and a coupling's law, if there are any, or with a law. Scenes model rigid bodies:
         where contacts of MuJoCo converge to another motion, their limit is that of its springs.
         """
-        found = {name: each.records for name, each in self._found.items() if each is not None}
+        found = {name: each.records for name, each in self._references.items() if each is not None}
         laws = [name for name in found if METHODS[name].has_law]
         centers = [name for name in laws if METHODS[name].is_rigid] or laws or list(found)
         apart = [

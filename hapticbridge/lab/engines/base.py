@@ -485,5 +485,5 @@ def open_engine(name: str) -> Engine:
         raise StudyError(
             f"engine '{name}' is not installed ({error}): {install_command('peers')}"
         ) from None
-    found: tuple[Engine, ...] = module.engines()
-    return next(engine for engine in found if engine.name == name)
+    engines_of_module: tuple[Engine, ...] = module.engines()
+    return next(engine for engine in engines_of_module if engine.name == name)

@@ -109,14 +109,14 @@ def totals(selected: Table) -> dict[str, Any]:
 
 def compared(table: Table) -> list[dict[str, Any]]:
     """Returns the totals of each treatment, over all rigs and on each; ``rig`` is then empty."""
-    found = []
+    rows = []
     for name, rig in itertools.product(TREATMENTS, ("", *COMPARED_RIGS)):
         is_selected = table["treatment"] == name
         if rig:
             is_selected &= table["rig"] == rig
         if is_selected.any():
-            found.append({"treatment": name, "rig": rig, **totals(table.select(is_selected))})
-    return found
+            rows.append({"treatment": name, "rig": rig, **totals(table.select(is_selected))})
+    return rows
 
 
 HANDS = {True: (0, 1), False: (4, 5)}
@@ -128,8 +128,8 @@ def cases_of(rig: str) -> list[Case]:
     is_shipped = RIGS[rig].is_shipped
     masses, frictions = ((0.1,), (0.4,)) if is_shipped else (MASSES, FRICTIONS)
     stiffnesses = STIFFNESSES[:1] if is_shipped else STIFFNESSES
-    found = itertools.product(stiffnesses, masses, frictions, HANDS[is_shipped])
-    return [Case(rig, *values) for values in found]
+    combinations = itertools.product(stiffnesses, masses, frictions, HANDS[is_shipped])
+    return [Case(rig, *values) for values in combinations]
 
 
 STEPS = (0.25, 20.0)
@@ -196,14 +196,14 @@ def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _draw_bars(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
-    if not found:
+def _draw_bars(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    if not rows:
         base.say_missing(axes)
         return
-    left = np.zeros(len(found))
-    names = [one["treatment"] for one in found]
+    left = np.zeros(len(rows))
+    names = [one["treatment"] for one in rows]
     for verdict, colour in zip(base.VERDICTS[:3], base.COLOURS[:3], strict=True):
-        width = np.array([one[verdict.replace(" ", "_")] for one in found])
+        width = np.array([one[verdict.replace(" ", "_")] for one in rows])
         axes.barh(names, width, left=left, color=colour, height=0.8)
         left = left + width
     axes.invert_yaxis()
@@ -221,8 +221,8 @@ def _draw_energy(axes: Axes) -> None:
     axes.legend(fontsize="small")
 
 
-def _draw_depths(axes: Axes, found: Sequence[Mapping[str, Any]], quantity: str, words: str) -> None:
-    depth = {(one["treatment"], one["rig"]): 1e6 * one[quantity] for one in found}
+def _draw_depths(axes: Axes, rows: Sequence[Mapping[str, Any]], quantity: str, words: str) -> None:
+    depth = {(one["treatment"], one["rig"]): 1e6 * one[quantity] for one in rows}
     for place, treatment in enumerate(TREATMENTS):
         depths = [depth.get((treatment, rig), np.nan) for rig in COMPARED_RIGS]
         axes.plot(np.maximum(depths, 1e-4), COMPARED_RIGS, "osv^D"[place], ms=4, label=treatment)

@@ -312,15 +312,15 @@ def _draw_regions(axes: Axes, cells: Table) -> None:
     axes.set_title("B = 0: pressed, and knocked; one law", fontsize="medium")
 
 
-def _draw_friction(axes: Axes, found: Mapping[str, Any]) -> None:
+def _draw_friction(axes: Axes, tables: Mapping[str, Any]) -> None:
     axes.set(xlabel="requested coupling damping B (N s/m)", ylabel="friction needed, f_c/(K Δ)")
     axes.set_title(f"with a damper, b = {DAMPED:g} N s/m", fontsize="medium")
-    if not found:
+    if not tables:
         base.say_missing(axes)
         return
     for name, size in zip(METHODS_SHOWN, SIZES, strict=True):
-        if name in found:
-            selected, colour = found[name], base.METHOD_COLOURS[name]
+        if name in tables:
+            selected, colour = tables[name], base.METHOD_COLOURS[name]
             style: dict[str, Any] = {"color": colour, "mfc": "white", "ls": "", "ms": size}
             axes.plot(
                 selected["damping"],
@@ -334,7 +334,7 @@ def _draw_friction(axes: Axes, found: Mapping[str, Any]) -> None:
     for what, marker in MARKERS.items():
         axes.plot([], [], marker, color="black", mfc="white", label=f"measured: {WORDS[what]}")
     # room above for the names
-    axes.set_ylim(0, 1.75 * max(max(selected["predicted"]) for selected in found.values()))
+    axes.set_ylim(0, 1.75 * max(max(selected["predicted"]) for selected in tables.values()))
     lines = Line2D([], [], ls="", label="lines: f_c = K Δ/2 + B′ Δ/T")
     axes.legend(
         handles=[lines, *axes.get_legend_handles_labels()[0]], fontsize="small", loc="upper left"

@@ -596,9 +596,9 @@ TICKS = 3000
 """Ticks of a run with MuJoCo in the loop: 3 s, in which a force that decays vanishes."""
 
 
-def _in_mujoco(share: float) -> NDArray[np.float64]:
+def _in_mujoco(ratio: float) -> NDArray[np.float64]:
     bound = COUPLING.stiffness * PERIOD / 2 + COUPLING.damping
-    hand = WorstHand(share * bound, np.pi / PERIOD, PERIOD)
+    hand = WorstHand(ratio * bound, np.pi / PERIOD, PERIOD)
     return hold(ImplicitMass(COUPLING, PERIOD, HEAVY).force, hand, TICKS)
 
 
@@ -655,10 +655,10 @@ def worst_hand_section() -> Section:
     frequency = loop.worst_frequency()
     response = complex(loop.response(frequency))
     bound = float(loop.damping_spectrum(frequency))
-    for share, colour in ((0.98, "C3"), (1.02, "C0")):
-        hand = WorstHand(share * bound, frequency, PERIOD, response)
-        _draw_envelope(delayed, np.abs(loop.simulate(hand, 1500).force), share, colour)
-        _draw_envelope(simulated, np.abs(_in_mujoco(share))[:300], share, colour)
+    for ratio, colour in ((0.98, "C3"), (1.02, "C0")):
+        hand = WorstHand(ratio * bound, frequency, PERIOD, response)
+        _draw_envelope(delayed, np.abs(loop.simulate(hand, 1500).force), ratio, colour)
+        _draw_envelope(simulated, np.abs(_in_mujoco(ratio))[:300], ratio, colour)
     delayed.set_title(
         f"one sample of delay, wall; worst at {frequency / 2 / np.pi:.0f} Hz", fontsize="small"
     )
@@ -687,13 +687,13 @@ def worst_hand_section() -> Section:
     )
     checks.extend(
         Check(
-            quantity=f"heavy tool, b = {share:g} of (6): 1 if the force decays",
+            quantity=f"heavy tool, b = {ratio:g} of (6): 1 if the force decays",
             route="MuJoCo in the loop",
             expected=expected,
-            got=float(decays(_in_mujoco(share), TICKS)),
+            got=float(decays(_in_mujoco(ratio), TICKS)),
             tolerance=0.0,
         )
-        for share, expected in ((0.98, 0.0), (1.02, 1.0))
+        for ratio, expected in ((0.98, 0.0), (1.02, 1.0))
     )
     return Section(
         equation="worst hand",
@@ -713,10 +713,10 @@ def worst_hand_section() -> Section:
     )
 
 
-def _draw_envelope(axes: Axes, force: NDArray[np.float64], share: float, colour: str) -> None:
+def _draw_envelope(axes: Axes, force: NDArray[np.float64], ratio: float, colour: str) -> None:
     """Draws the largest force of every 20 ticks, relative to the first."""
     blocks = force[: len(force) // 20 * 20].reshape(-1, 20).max(axis=1)
     time = 20e3 * PERIOD * np.arange(len(blocks))
-    axes.semilogy(time, blocks / blocks[0], color=colour, label=f"b = {share:g} of the bound")
+    axes.semilogy(time, blocks / blocks[0], color=colour, label=f"b = {ratio:g} of the bound")
     axes.set(xlabel="time (ms)", ylabel="largest force, over the first")
     axes.legend(fontsize="small", loc="upper left")
