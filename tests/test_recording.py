@@ -97,11 +97,11 @@ def test_library_reads_events_metadata_and_attachments_in_time_order(whole: Path
     with whole.open("rb") as stream:
         reader = SeekingReader(stream, validate_crcs=True)
         times = [message.log_time for _, _, message in reader.iter_messages()]
-        events = [json.loads(m.data) for _, _, m in reader.iter_messages(topics=["/event"])]
+        messages = [m.data for _, _, m in reader.iter_messages(topics=["/event"])]
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
         attachments = {item.name: item.data for item in reader.iter_attachments()}
     assert times == sorted(times)
-    assert events == read_recording(whole).events
+    assert [json.loads(layout.event_of(each)) for each in messages] == read_recording(whole).events
     assert metadata["hapticbridge"]["µ"] == "ü"
     assert attachments == {item.name: item.data for item in FILES}
 

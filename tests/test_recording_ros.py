@@ -106,17 +106,20 @@ def test_events_are_lines_of_the_log(tmp_path: Path) -> None:
 
 def test_rosbags_reads_every_topic(run: Path) -> None:
     seen: dict[str, int] = {}
+    texts = []
     with AnyReader([run]) as reader:
         types = {each.topic: each.msgtype for each in reader.connections}
         for connection, _, raw in reader.messages():
             seen[connection.topic] = seen.get(connection.topic, 0) + 1
-            if connection.topic != "/event":  # JSON, whose text is in the log, too
-                reader.deserialize(raw, connection.msgtype)
+            message: Any = reader.deserialize(raw, connection.msgtype)
+            if connection.topic == "/event":
+                texts.append(json.loads(message.data))
     assert {topic: types[topic] for topic in TOPICS} == {
         topic: name for topic, (name, _) in TOPICS.items()
     }
     assert seen["/tick"] == 1500
     assert seen["/rosout"] == seen["/event"] > 0
+    assert texts == read_recording(run).events
 
 
 def test_units_stand_in_the_schemas(run: Path) -> None:

@@ -17,7 +17,7 @@ import hapticbridge as hb
 from hapticbridge import scene as scenes
 from hapticbridge.audit.recorded_scene import compile_recorded, is_as_recorded
 from hapticbridge.cli import main
-from hapticbridge.run.description import compiled_model
+from hapticbridge.run.description import model_digest
 from hapticbridge.scene import load_scene, scene_path
 
 PARAMETERS = [
@@ -150,7 +150,7 @@ def test_both_ends_of_a_shipped_range_load_and_differ(
     low = load_scene(name, None, as_is=False, **{parameter.name: parameter.minimum})
     high = load_scene(name, None, as_is=False, **{parameter.name: parameter.maximum})
     assert low.parameters[parameter.name] == parameter.minimum
-    assert compiled_model(low.model) != compiled_model(high.model)
+    assert model_digest(low.model) != model_digest(high.model)
     assert parameter.about
     assert parameter.unit in {"", "m", "N", "N m", "N s/m", "kg", "N/m", "N m/rad", "rad", "s"}
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import socket
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import pytest
 from audit_cases import recorded
 from hypothesis import given
@@ -18,7 +21,7 @@ from outside_scenes import RICH, mjcf, obj_bytes, png_bytes, scene_file, stl_byt
 
 from hapticbridge.audit import audit
 from hapticbridge.errors import SceneError
-from hapticbridge.run.description import compiled_model
+from hapticbridge.run.description import model_digest
 from hapticbridge.scene import load_scene
 from hapticbridge.scene.source import read_elements
 
@@ -158,6 +161,7 @@ def test_sources_are_every_file_and_rebuild_the_same_model(tmp_path: Path, layou
     sources = {source.name: source.data for source in scene.sources}
     assert Path(scene.sources[0].name).name == "main.xml"
     expected = {n: c.encode() if isinstance(c, str) else c for n, c in layout.items()}
+    expected = {n: c.replace(b"/home/somebody/cad/", b"") for n, c in expected.items()}
     if "geometry/a.stl" in layout:
         del expected["a.stl"]  # hidden by meshdir
     inner = "Zähne und Löcher/" if main.startswith("Z") else ""
@@ -165,7 +169,7 @@ def test_sources_are_every_file_and_rebuild_the_same_model(tmp_path: Path, layou
     for name, data in sources.items():
         scene_file(tmp_path / "rebuilt1" / inner, data, name)
     again = load_scene(tmp_path / "rebuilt1" / inner / scene.sources[0].name)
-    assert compiled_model(again.model) == compiled_model(scene.model)
+    assert model_digest(again.model) == model_digest(scene.model)
 
 
 def test_relative_path_works_everywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -189,16 +193,95 @@ def test_elements_are_read_with_their_lines_and_values() -> None:
     assert found == [("a", {}, 1), ("b", {"p": "1", "q": "a & <b>"}, 3), ("c:d", {"r": "2"}, 5)]
 
 
-def test_compiled_model_does_not_depend_on_the_folder_or_tell_it(tmp_path: Path) -> None:
-    compiled = []
+def test_digest_does_not_depend_on_the_folder(tmp_path: Path) -> None:
+    digests = []
     for folder in (tmp_path / "a", tmp_path / "elsewhere" / "b"):
         for name, content in LAYOUTS["obj and meshdir"].items():
             scene_file(folder, content, name)
-        compiled.append(compiled_model(load_scene(folder / "main.xml").model))
-    assert compiled[0] == compiled[1]
-    assert str(tmp_path).encode() not in compiled[0]
+        digests.append(model_digest(load_scene(folder / "main.xml").model))
+    assert digests[0] == digests[1]
     path = scene_file(tmp_path, RICH)
-    assert compiled_model(load_scene(path).model) == compiled_model(load_scene(path).model)
+    assert model_digest(load_scene(path).model) == model_digest(load_scene(path).model)
+
+
+def test_digest_changes_with_every_number_of_a_model_but_the_names_of_its_files(
+    tmp_path: Path,
+) -> None:
+    for name, content in LAYOUTS["obj and meshdir"].items():
+        scene_file(tmp_path, content, name)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "main.xml"))
+    seen = {model_digest(model)}
+    fields = [each for each in dir(model) if not each.startswith("_")]
+    arrays = [each for each in fields if isinstance(getattr(model, each), np.ndarray)]
+    for field in arrays:
+        values = getattr(model, field)
+        if not values.size or not values.flags.writeable:
+            continue
+        kept, values.flat[0] = values.flat[0].copy(), not values.flat[0]
+        is_seen = model_digest(model) in seen
+        assert is_seen == field.endswith("_pathadr"), field
+        values.flat[0] = kept
+    model.opt.o_margin = 0.5
+    assert model_digest(model) not in seen
+
+
+OUTSIDE: Layout = {
+    "scenes/main.xml": mjcf(
+        "<!-- as <mesh file='/gone/old.stl'/> and <include file='../../../../far.xml'/> were -->",
+        "<compiler meshdir='{0}/kept/meshes' texturedir='{0}/kept/looks'/>",
+        "<include file='{0}/kept/parts/common.xml'/>",
+        "<asset><model name='r' file='{0}/kept/robot/r.xml'/><hfield name='h' "
+        "file='{0}/kept/meshes/h.png' size='1 1 1 1'/><texture name='t' type='cube' "
+        "fileright='{0}/kept/looks/t.png' fileleft='t.png'/></asset>",
+        MESH.format("a.stl"),
+        body=MESHED,
+        world="<frame pos='1 0 0'><attach model='r' body='arm' prefix='r_'/></frame>",
+    ),
+    "kept/meshes/a.stl": stl_bytes(),
+    "kept/meshes/h.png": png_bytes(),
+    "kept/looks/t.png": png_bytes(),
+    "kept/parts/common.xml": PART.format(LOW),
+    "kept/robot/r.xml": "<mujoco><asset><mesh name='m' file='{0}/kept/robot/deep/m.obj'/></asset>"
+    "<worldbody><body name='arm'><joint/><geom type='mesh' mesh='m' mass='1'/></body></worldbody>"
+    "</mujoco>",
+    "kept/robot/deep/m.obj": obj_bytes(),
+}
+"""Names as programs write them that know only absolute paths, and names that lead nowhere."""
+
+
+@pytest.mark.parametrize("start", ["a file", "a relative name", "a specification"])
+def test_names_that_lead_out_of_the_folder_are_recorded_as_names_in_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: str
+) -> None:
+    folder = tmp_path / "user"
+    for name, content in OUTSIDE.items():
+        text = content.format(folder) if isinstance(content, str) else content
+        scene_file(folder, text, name)
+    monkeypatch.chdir(folder)
+    path = folder / "scenes/main.xml"
+    scene = load_scene(
+        mujoco.MjSpec.from_file(str(path))
+        if start == "a specification"
+        else path.relative_to(folder)
+        if start == "a relative name"
+        else path
+    )
+    recording = tmp_path / "run.mcap"
+    recorded(recording, scene, duration=0.1)
+    for source in scene.sources:
+        assert str(tmp_path).encode() not in source.data, source.name
+    shutil.rmtree(folder)
+    report = audit(recording)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+def test_a_zipped_scene_with_a_mesh_is_audited(tmp_path: Path) -> None:
+    path = tmp_path / "scene.mjz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("scene.xml", mjcf(MESH.format("a.stl"), body=MESHED))
+        archive.writestr("a.stl", stl_bytes())
+    recorded(tmp_path / "run.mcap", load_scene(path), duration=0.1)
+    assert audit(tmp_path / "run.mcap").resimulation == "bit for bit"
 
 
 def built_spec() -> mujoco.MjSpec:

@@ -8,8 +8,8 @@ still has them.
 and one packed ``TICK_DTYPE`` record. Every field is 8 bytes wide, so CDR adds no padding.
 - Topics ``/tick_2``, ``/tick_3`` … with equal schema: the records of further hands, if several hold
 the scene. The metadata ``hands`` hold what differs from the first hand's (``further_hands``).
-- Topic ``/event``, encoding ``json``: one object per event, with ``event`` (its name) and
-``time_ns`` (since the start of the run).
+- Topic ``/event``, encoding ``cdr``, schema ``std_msgs/msg/String``: one JSON object per event,
+with ``event`` (its name) and ``time_ns`` (since the start of the run).
 - Topics with types of ROS 2 for other programs, which follow from the above (``ros_messages``).
 
 The log time of a message is ``epoch_ns`` (in the metadata: Unix time of the run's start) plus the
@@ -33,13 +33,10 @@ from hapticbridge.kernel.record import FORMAT, TICK_DTYPE, columns_of
 TICK_TOPIC = "/tick"
 EVENT_TOPIC = "/event"
 TICK_ENCODING = "cdr"
-EVENT_ENCODING = "json"
+EVENT_SCHEMA_NAME = "std_msgs/msg/String"
+EVENT_SCHEMA = b"string data # the event and what belongs to it, as JSON\n"
 TICK_SCHEMA_NAME = "hapticbridge/msg/Tick"
 TICK_SCHEMA_ENCODING = "ros2msg"
-NO_SCHEMA = 0
-"""Schema number of a topic without one, as MCAP has it: JSON describes itself, and readers of ROS 2
-refuse a file with a schema that is not ROS's."""
-
 PROFILE = "ros2"
 """Profile of the file, by which readers of ROS 2 know it."""
 
@@ -168,6 +165,23 @@ def event_payload(event: Mapping[str, object], time_ns: int) -> bytes:
     """
     plain = _plain({**event, "time_ns": int(time_ns)})
     return json.dumps(plain, separators=(",", ":"), allow_nan=False).encode()
+
+
+def event_message(payload: bytes) -> bytes:
+    """Returns the message on ``/event`` with an event's JSON."""
+    return CDR_HEADER + (len(payload) + 1).to_bytes(4, "little") + payload + b"\0"
+
+
+def event_of(data: bytes) -> bytes:
+    """Returns an event's JSON from its message; inverse of ``event_message``.
+
+    Raises:
+        ValueError: It is no such message.
+    """
+    payload = data[len(CDR_HEADER) + 4 : -1]
+    if data != event_message(payload):
+        raise ValueError("not one text in CDR")
+    return payload
 
 
 def _plain(value: object) -> object:

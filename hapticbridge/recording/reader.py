@@ -151,10 +151,10 @@ class Contents:
     def _add_channel(self, fields: Fields) -> None:
         channel, schema_id = fields.number(2), fields.number(2)
         topic, encoding = fields.text(), fields.text()
-        if topic == layout.EVENT_TOPIC and encoding == layout.EVENT_ENCODING:
+        name, schema_encoding, text = self._schemas.get(schema_id, ("", "", b""))
+        if topic == layout.EVENT_TOPIC and name == layout.EVENT_SCHEMA_NAME:
             self._topics[channel] = topic
         if topic in ros_messages.TOPICS:
-            name, schema_encoding, text = self._schemas.get(schema_id, ("", "", b""))
             own_name, own_text = ros_messages.TOPICS[topic]
             stored = name, schema_encoding, encoding, layout.without_comments(text)
             own = own_name, layout.TICK_SCHEMA_ENCODING, layout.TICK_ENCODING
@@ -162,7 +162,6 @@ class Contents:
                 raise DamageError(f"its topic {topic} has another schema than '{own_name}'")
             self._topics[channel], self.has_messages = topic, True
         if topic in _HANDS and channel not in self._topics:
-            name, schema_encoding, text = self._schemas.get(schema_id, ("", "", b""))
             if (name, schema_encoding) != (layout.TICK_SCHEMA_NAME, layout.TICK_SCHEMA_ENCODING):
                 self.refusal = (
                     f"its topic {topic} has the schema '{name}', not '{layout.TICK_SCHEMA_NAME}'"
@@ -202,8 +201,9 @@ class Contents:
             raise DamageError(f"a message on {layout.tick_topic(hand)} is not one record")
         return position
 
-    def _add_event(self, payload: bytes) -> None:
+    def _add_event(self, message: bytes) -> None:
         try:
+            payload = layout.event_of(message)
             event = read_json(payload)
         except ValueError as error:
             raise DamageError("an event is not JSON") from error

@@ -284,8 +284,11 @@ class RecordingWriter:
         )
         first, *others = map(layout.tick_topic, range(len(self._sequences)))
         self._ticks = [self._mcap.register_channel(first, layout.TICK_ENCODING, tick_schema)]
+        event_schema = self._mcap.register_schema(
+            layout.EVENT_SCHEMA_NAME, layout.TICK_SCHEMA_ENCODING, layout.EVENT_SCHEMA
+        )
         self._events = self._mcap.register_channel(
-            layout.EVENT_TOPIC, layout.EVENT_ENCODING, layout.NO_SCHEMA
+            layout.EVENT_TOPIC, layout.TICK_ENCODING, event_schema
         )
         schemas = {
             name: self._mcap.register_schema(name, layout.TICK_SCHEMA_ENCODING, text)
@@ -348,7 +351,7 @@ class RecordingWriter:
         payload = layout.event_payload(event, time_ns)
         time = (self._epoch + int(time_ns)) % 2**64
         try:
-            self._mcap.add_message(self._events, time, payload, time)
+            self._mcap.add_message(self._events, time, layout.event_message(payload), time)
             time, line = self._messages.of_event(payload, int(time_ns), event.get("event"))
             self._mcap.add_message(self._channels[ros_messages.LOG], time, line, time)
         except OSError as error:

@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import platform
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from datetime import UTC, datetime
@@ -43,16 +44,26 @@ _STORED = {"start_kinetic": "kinetic", "start_potential": "potential"}
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
-def compiled_model(model: mujoco.MjModel) -> bytes:
-    """Returns the bytes of ``mj_saveModel``, equal in every compilation of one scene."""
-    buffer = np.zeros(mujoco.mj_sizeModel(model), dtype=np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes()
-
-
 def model_digest(model: mujoco.MjModel) -> str:
-    """Returns the SHA-256 of a compiled model."""
-    return hashlib.sha256(compiled_model(model)).hexdigest()
+    """Returns the SHA-256 of every number and name that a compiled model computes with.
+
+    The names of its files and what follows from their length are left out: a mesh is its vertices,
+    whatever it was called. So is ``vis``, by which it is drawn.
+    """
+    digest = hashlib.sha256()
+    for part in (model, model.opt, model.stat):
+        for name in sorted(dir(part)):
+            if not name.startswith("_") and not _OF_FILES.fullmatch(name):
+                value = getattr(part, name)
+                if isinstance(value, np.ndarray):
+                    digest.update(f"{name} {value.dtype} {value.shape} ".encode())
+                    digest.update(np.ascontiguousarray(value).tobytes())
+                elif isinstance(value, bytes | int | float):
+                    digest.update(f"{name} {value!r} ".encode())
+    return digest.hexdigest()
+
+
+_OF_FILES = re.compile("n?paths|.*_pathadr|nbuffer")
 
 
 def start_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:

@@ -11,7 +11,6 @@ import numpy as np
 
 from hapticbridge.kernel.codes import coupling_ids, handle_ids
 from hapticbridge.kernel.mujoco_c import quiet
-from hapticbridge.scene.source import SourceFile
 
 # Custom texts and numbers of a scene (``<custom>`` in MJCF), by name
 
@@ -161,56 +160,6 @@ def _is_servo(model: mujoco.MjModel, actuator: int) -> bool:
 
 SERVO_ERROR = 1e-6
 """Smallest distance in m or rad between a servo's pose and zero that is worth a change."""
-
-
-def compiled(spec: mujoco.MjSpec, sources: tuple[SourceFile, ...]) -> mujoco.MjModel:
-    """Compiles a scene from the bytes of its files, independent of their folder.
-
-    A compiled model names the files of its meshes and textures. With their paths it would differ
-    from folder to folder, and a recording would reveal the user's folders. Files that only MuJoCo
-    finds are read from their place.
-    """
-    main, *assets = sources
-    if not assets:
-        return spec.compile()
-    inner = main.name.rpartition("/")[0]
-    portable = spec.copy()
-    portable.modelfiledir = inner
-    portable.assets = {source.name: source.data for source in assets}
-    try:
-        model = portable.compile()
-        folder = spec.modelfiledir.removesuffix("/").removesuffix(inner).removesuffix("/") + "/"
-        if _name_by_source(portable, model, folder, sources):
-            return portable.compile()
-    except ValueError:
-        return spec.compile()
-    return model
-
-
-def _name_by_source(
-    spec: mujoco.MjSpec, model: mujoco.MjModel, folder: str, sources: tuple[SourceFile, ...]
-) -> bool:
-    """Names files of nested includes and attached models, which keep their absolute paths.
-
-    They get the path that they would have if the scene's folder were the root.
-
-    Returns:
-        True if there were any.
-    """
-    known = {source.name: source.data for source in sources}
-    named = {}
-    kinds = (spec.meshes, "mesh"), (spec.hfields, "hfield"), (spec.textures, "tex")
-    for elements, kind in kinds:
-        for element in elements:
-            start = int(getattr(model, f"{kind}_pathadr")[element.id])
-            path = model.paths[start:].split(b"\0", 1)[0].decode() if start >= 0 else ""
-            name = path.removeprefix(folder)
-            if name != path and name in known:
-                named[element] = name
-    for element, name in named.items():
-        element.file = f"/{name}"
-        spec.assets |= {f"/{name}": known[name]}
-    return bool(named)
 
 
 def _malformed(match: re.Match[str]) -> str:

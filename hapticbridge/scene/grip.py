@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.codes import Grip
-from hapticbridge.scene.compile import compiled, reset
-from hapticbridge.scene.source import SourceFile
+from hapticbridge.scene.compile import reset
 
 MAX_OFFERED = 4
 """Number of grips that a refusal names. More would make its sentence too long to read."""
@@ -151,13 +150,12 @@ def _rim(model: mujoco.MjModel, body_id: int) -> NDArray[np.float64] | None:
     return np.asarray(model.body_ipos[body_id] + reach * across) if reach > 0.0 else None
 
 
-def add_grip(spec: mujoco.MjSpec, grip: str, sources: tuple[SourceFile, ...]) -> list[str]:
+def add_grip(spec: mujoco.MjSpec, grip: str) -> list[str]:
     """Adds a site for a grip that is a body or a point of one; returns warnings.
 
     Args:
         spec: The user's scene; unchanged if the grip is one of its sites.
         grip: Name of a site, ``BODY``, ``BODY@x,y,z`` or ``joint:NAME``.
-        sources: Files of the scene.
 
     Raises:
         SceneError: The scene has no such site, body or joint; the message offers others. Or the
@@ -175,7 +173,7 @@ def add_grip(spec: mujoco.MjSpec, grip: str, sources: tuple[SourceFile, ...]) ->
             f"'{grip}' is a site and a body, and the hand holds the site; '{grip}@0,0,0' is the "
             "body at its origin"
         ]
-    model = compiled(spec.copy(), sources)
+    model = spec.copy().compile()
     if len(spec.bodies) == model.nbody:  # not if MuJoCo fused bodies
         bodies |= {str(i): body for i, body in enumerate(spec.bodies) if not body.name}
     name, is_point, text = (grip, "", "") if grip in bodies else grip.rpartition("@")

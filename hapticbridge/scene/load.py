@@ -25,7 +25,6 @@ from hapticbridge.scene.compile import (
     START_KEYFRAME,
     SceneChange,
     clause,
-    compiled,
     find_start,
     hold_servos,
     seat_handle,
@@ -237,13 +236,14 @@ def _written(source: SceneSource) -> SceneSource:
         spec = mujoco.MjSpec.from_string(
             main.data.decode(), assets={asset.name: asset.data for asset in assets}
         )
+    spec.modelfiledir = main.name.rpartition("/")[0]
     return replace(source, spec=spec)
 
 
 def plain_model(source: SceneSource) -> mujoco.MjModel:
     """Compiles a scene without handle and coupling, so that it needs no grip."""
     with _refused(source.path):
-        return compiled(source.spec.copy(), source.sources)
+        return source.spec.copy().compile()
 
 
 MIN_MEMORY = 13 << 20
@@ -283,18 +283,18 @@ def compile_scene(
     if not grips:
         raise SceneError(f"no grip is named for scene '{path}'; name one per hand")
     with _refused(path):
-        about_grip = [said for each in grips for said in add_grip(spec, each, source.sources)]
+        about_grip = [said for each in grips for said in add_grip(spec, each)]
     attach_handles(spec, grips)
     changes = set_options(spec, as_is=as_is)
     with _refused(path):
-        model = compiled(spec, source.sources)
+        model = spec.compile()
         if model.narena < MIN_MEMORY:
             before, spec.memory, spec.nstack, spec.njmax = model.narena, -1, -1, -1
-            model = compiled(spec, source.sources)
+            model = spec.compile()
             sizes = (format_si(size, "B") for size in (before, model.narena))
             changes += (SceneChange(f"memory: {' → '.join(sizes)}"),)
         if not as_is and (excluded := exclude_nested(spec, model, grips[0])):
-            changes, model = changes + excluded, compiled(spec, source.sources)
+            changes, model = changes + excluded, spec.compile()
         concerns = [*source.concerns, *about_grip]
         for each in dict.fromkeys(grips):
             concerns += check_model(model, each)
@@ -335,7 +335,7 @@ def _start_set(
     if start.positions is not None:
         if not has_keyframe:
             spec.add_key(name=START_KEYFRAME)
-            model = compiled(spec, source.sources)
+            model = spec.compile()
         model.key_qpos[find_start(model)] = start.positions
     held = hold_servos(model) if has_keyframe and not as_is else ()
     return model, start.changes + held, start.remaining

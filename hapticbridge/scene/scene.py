@@ -24,7 +24,7 @@ from hapticbridge.kernel.colliders import use_exact_points
 from hapticbridge.kernel.mujoco_c import warning_of
 from hapticbridge.kernel.pose import IDENTITY_POSE
 from hapticbridge.kernel.rigid_contact import IMPRATIO, MARGIN, MAX_MARGIN, largest_margin
-from hapticbridge.scene.compile import SceneChange, clause, compiled, go_to_start
+from hapticbridge.scene.compile import SceneChange, clause, go_to_start
 from hapticbridge.scene.contacts import announce_soft_equalities
 from hapticbridge.scene.handle import (
     add_weld,
@@ -302,7 +302,7 @@ class Scene:
         self.reset()
 
     def _recompile(self, spec: mujoco.MjSpec) -> None:
-        model = compiled(spec, self.sources)
+        model = spec.compile()
         carry_over(self.model, model)
         self.model, self.data = model, mujoco.MjData(model)
 

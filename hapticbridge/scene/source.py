@@ -7,11 +7,12 @@ order and searches height fields in the wrong folder.
 
 from __future__ import annotations
 
+import os
 import re
 import stat
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from html import unescape
+from html import escape, unescape
 from pathlib import Path
 
 from hapticbridge.errors import SceneError
@@ -65,12 +66,17 @@ class Element:
     line: int
 
 
+_ARCHIVE = b"PK"
+"""Start of a zipped scene, whose names lead nowhere else."""
+
+
 def collect_sources(path: Path, main: bytes | None = None) -> tuple[SourceFile, ...]:
     """Returns the main file, first, and all existing files that it refers to.
 
     A parameter file beside the main file is included. A file that is not found here (in a search
-    path of MuJoCo's own) is left out without an error. Written into an empty folder under their
-    names, the files compile to an identical model.
+    path of MuJoCo's own) is left out without an error. Names that lead out of the scene's folder,
+    as absolute ones do, are rewritten: written into an empty folder under their names, the files
+    compile to an identical model.
 
     Args:
         path: The main file.
@@ -80,7 +86,8 @@ def collect_sources(path: Path, main: bytes | None = None) -> tuple[SourceFile, 
         SceneError: A name leads to a device, pipe or socket, or through a link out of the folder.
     """
     files: dict[Path, Path] = {}
-    _find_files(path, files, main)
+    homes: dict[Path, _Home] = {}
+    _find_files(path, files, homes, main)
     parameters = parameters_file(path)
     if main is None and parameters.is_file():
         files.setdefault(_key(parameters), parameters)
@@ -89,11 +96,14 @@ def collect_sources(path: Path, main: bytes | None = None) -> tuple[SourceFile, 
     while not all(file.is_relative_to(root) for file in (*files, *passed)) and root != root.parent:
         root = root.parent
     _refuse_links(files, root, path)
-    names = (file.relative_to(root if file.is_relative_to(root) else file.anchor) for file in files)
-    return tuple(
-        SourceFile(name.as_posix(), main if main and file is path else file.read_bytes())
-        for name, file in zip(names, files.values(), strict=True)
-    )
+    sources = []
+    for key, file in files.items():
+        name = key.relative_to(root if key.is_relative_to(root) else key.anchor).as_posix()
+        data = main if main and file is path else file.read_bytes()
+        if key in homes and not data.startswith(_ARCHIVE):
+            data = homes[key].with_inner_names(data, name.count("/"), root)
+        sources.append(SourceFile(name, data))
+    return tuple(sources)
 
 
 _FILE_NAME = re.compile(
@@ -118,17 +128,68 @@ def refuse_outside(data: bytes, name: str) -> int:
     """
     text = data.decode("utf-8-sig", errors="replace")
     names = {unescape(double or single) for double, single in _FILE_NAME.findall(text)}
-    depth, climb = name.count("/"), 0
-    for found in names:
-        parts = found.replace("\\", "/").split("/")
-        climb = max(climb, parts.count(".."))
-        is_absolute = found[:1] in ("/", "\\", "~") or ":" in parts[0]
-        if is_absolute or parts.count("..") > depth:
+    for each in names:
+        if _leads_out(each, name.count("/")):
             raise SceneError(
-                f"'{name}' names the file '{found:.80}', which lies outside the scene's folder; a "
+                f"'{name}' names the file '{each:.80}', which lies outside the scene's folder; a "
                 "recording's scene may only name its own files"
             )
-    return climb
+    return max((_parts(each).count("..") for each in names), default=0)
+
+
+def _parts(name: str) -> list[str]:
+    return name.replace("\\", "/").split("/")
+
+
+def _leads_out(name: str, depth: int) -> bool:
+    """Returns True if a name in a file that lies so many folders deep leads out of the scene's."""
+    parts = _parts(name)
+    is_absolute = name[:1] in ("/", "\\", "~") or ":" in parts[0]
+    return is_absolute or parts.count("..") > depth
+
+
+@dataclass(frozen=True, slots=True)
+class _Home:
+    """Folders to which the names in a model's XML files are relative.
+
+    Attributes:
+        folder: Folder of the model's main file.
+        folders: Settings of its compiler, as from ``_asset_folders``.
+    """
+
+    folder: Path
+    folders: dict[str, str]
+
+    def of(self, tag: str) -> Path:
+        """Returns the folder to which the file names of an element are relative."""
+        if tag in _NAMED_FROM_HOME:
+            return self.folder
+        return self.folder / self.folders["texturedir" if tag == "texture" else "meshdir"]
+
+    def with_inner_names(self, data: bytes, depth: int, root: Path) -> bytes:
+        """Returns an XML file with names that ``refuse_outside`` lets pass.
+
+        A name that leads out of the scene's folder ``root`` is written relative to its own. What
+        does not lie in it has no file there, as in a comment: the last part of its name stays.
+        """
+        text, pieces, end = data.decode("utf-8", errors="surrogateescape"), [], 0
+        for match in _FILE_NAME.finditer(text):
+            group = 1 if match[1] is not None else 2
+            name = unescape(match[group])
+            if match.start(group) < end or not _leads_out(name, depth):
+                continue
+            tag = _TAG.match(text, text.rfind("<", 0, match.start()) + 1)
+            home, file = self.of(tag[0] if tag else ""), _key(self.folder / name)
+            inner = os.path.relpath(file, _key(home)) if file.is_relative_to(root) else ""
+            if not inner or _leads_out(inner, depth):
+                inner = _parts(name)[-1].rpartition(":")[-1]
+            pieces += [text[end : match.start(group)], escape(inner)]
+            end = match.end(group)
+        return "".join((*pieces, text[end:])).encode("utf-8", errors="surrogateescape")
+
+
+_TAG = re.compile(r"[\w.:-]*")
+_NAMED_FROM_HOME = {"include", "model", "compiler"}
 
 
 def read_elements(data: bytes) -> Iterator[Element]:
@@ -145,24 +206,30 @@ def read_elements(data: bytes) -> Iterator[Element]:
         yield Element(match[1], attributes, line)
 
 
-def _find_files(path: Path, files: dict[Path, Path], content: bytes | None = None) -> None:
-    """Adds a model's file, its includes, its assets and the models that it attaches."""
+def _find_files(
+    path: Path, files: dict[Path, Path], homes: dict[Path, _Home], content: bytes | None = None
+) -> None:
+    """Adds a model's file, its includes, its assets and the models that it attaches.
+
+    ``homes`` gets the folders of the model to which each XML file belongs.
+    """
     if _key(path) in files:
         return
     files[_key(path)] = path
     elements = list(_expanded(path, path.parent, {path}, content))
     folders = _asset_folders([element for element, _ in elements])
+    homes |= {_key(namer): _Home(path.absolute().parent, folders) for _, namer in elements}
     for element, namer in elements:
         for attribute in _FILE_ATTRIBUTES:
             reference = element.attributes.get(attribute)
             if reference is None:
                 continue
-            homes = path.parent, namer.parent
-            file = _existing(_candidates(reference, element.tag, homes, folders))
+            beside = path.parent, namer.parent
+            file = _existing(_candidates(reference, element.tag, beside, folders))
             if file is None:
                 continue
             if element.tag == "model":
-                _find_files(file, files)
+                _find_files(file, files, homes)
             else:
                 files.setdefault(_key(file), file)
 
@@ -218,7 +285,7 @@ def _candidates(
     reference: str, tag: str, homes: tuple[Path, Path], folders: dict[str, str]
 ) -> Iterator[Path]:
     """Yields the paths at which MuJoCo looks for an asset, in its order."""
-    if tag in {"include", "model"}:
+    if tag in _NAMED_FROM_HOME:
         yield from _beside(reference, homes)
         return
     folder = folders["texturedir" if tag == "texture" else "meshdir"]
