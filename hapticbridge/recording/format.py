@@ -167,19 +167,19 @@ def event_payload(event: Mapping[str, object], time_ns: int) -> bytes:
     return json.dumps(plain, separators=(",", ":"), allow_nan=False).encode()
 
 
-def event_message(payload: bytes) -> bytes:
-    """Returns the message on ``/event`` with an event's JSON."""
+def cdr_text(payload: bytes) -> bytes:
+    """Returns a ``std_msgs/String`` in CDR: its length with the final zero, then its bytes."""
     return CDR_HEADER + (len(payload) + 1).to_bytes(4, "little") + payload + b"\0"
 
 
 def event_of(data: bytes) -> bytes:
-    """Returns an event's JSON from its message; inverse of ``event_message``.
+    """Returns the JSON in a message on ``/event``; inverse of ``cdr_text``.
 
     Raises:
         ValueError: It is no such message.
     """
     payload = data[len(CDR_HEADER) + 4 : -1]
-    if data != event_message(payload):
+    if data != cdr_text(payload):
         raise ValueError("not one text in CDR")
     return payload
 

@@ -351,7 +351,7 @@ class RecordingWriter:
         payload = layout.event_payload(event, time_ns)
         time = (self._epoch + int(time_ns)) % 2**64
         try:
-            self._mcap.add_message(self._events, time, layout.event_message(payload), time)
+            self._mcap.add_message(self._events, time, layout.cdr_text(payload), time)
             time, line = self._messages.of_event(payload, int(time_ns), event.get("event"))
             self._mcap.add_message(self._channels[ros_messages.LOG], time, line, time)
         except OSError as error:
