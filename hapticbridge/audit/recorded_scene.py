@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -37,18 +37,17 @@ from hapticbridge.kernel.tick import simulate_recorded
 from hapticbridge.recording import RecordingFile
 from hapticbridge.run.description import (
     CARRIED,
-    SOURCE_PREFIX,
     metas_of,
     method_of,
     model_digest,
     parameters_of,
     requested_of,
 )
-from hapticbridge.run.request import RunRequest, request_of
+from hapticbridge.run.request import request_of
 from hapticbridge.run.slow_scene import SlowScene
-from hapticbridge.scene import Scene, load_scene, scene_parameters
+from hapticbridge.run.unpacked import load_unpacked, unpack_scene
+from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.rehearsal import static_load
-from hapticbridge.scene.source import refuse_outside
 
 SIMULATION_TIME, SLOWEST = 15, 20
 """Processor time in s that a simulation may take, and beyond it per second of the run. Machine code
@@ -130,70 +129,6 @@ def load_machine_code(name: str, contact: str, is_slow: bool) -> None:
 
 # Scene from its sources
 
-MAX_STEPS = 4
-"""Names that one path is joined from: asset folder, name in an include, in a model, in a file."""
-
-
-def unpack_scene(recording: RecordingFile, folder: Path) -> Path:
-    """Writes a recording's scene files to a folder; returns the main file.
-
-    The folder is created if missing; nothing is written outside it.
-
-    Raises:
-        RecordingError: The recording carries no scene, or files that cannot be written there.
-    """
-    main: Path | None = None
-    files = {
-        name: (PurePosixPath(name.removeprefix(SOURCE_PREFIX)), data)
-        for name, data in recording.attachments.items()
-        if name.startswith(SOURCE_PREFIX)
-    }
-    climbs = [
-        refuse_outside(data, inner.as_posix())
-        for inner, data in files.values()
-        if inner.suffix != ".toml"
-    ]
-    # a name may be taken relative to another file and to an asset folder that climbs, too
-    folder = folder.joinpath(*MAX_STEPS * max(climbs, default=0) * ["inner"])
-    for name, (inner, data) in files.items():
-        # a foreign recording must not write outside the folder
-        if inner.is_absolute() or ".." in inner.parts or "\\" in name or ":" in name:
-            raise RecordingError(
-                f"the attachment {name!r:.80} would lie outside the scene's folder"
-            )
-        path = folder / inner
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
-        except (OSError, ValueError, RecursionError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise RecordingError(
-                f"the attachment {name!r:.80} cannot be unpacked: {reason}"
-            ) from None
-        main = main or path
-    if main is None:
-        raise RecordingError(f"{recording.path} carries no scene, so it cannot be simulated again")
-    return main
-
-
-def load_unpacked(main: Path, request: RunRequest, *, is_carried: bool) -> Scene:
-    """Loads an unpacked scene as requested, with its tool carried or felt.
-
-    Raises:
-        SceneError: A parameter is out of range, or the scene cannot be loaded.
-    """
-    defaults = {each.name: each.default for each in scene_parameters(main)}
-    # a default that is set may differ from the file's number in its last digit
-    values = request.parameters.items()
-    changed = {name: value for name, value in values if defaults.get(name) != value}
-    grips = request.grips if len(request.grips) > 1 else request.grips[0]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # reported during the recorded run
-        scene = load_scene(main, grips, as_is=request.as_is, **changed)
-    if is_carried:
-        scene.carry_tool("as recorded")
-    return scene
-
 
 def compile_recorded(recording: RecordingFile) -> Scene:
     """Compiles the attached sources, and prepares the scene for the recorded method.
@@ -206,7 +141,7 @@ def compile_recorded(recording: RecordingFile) -> Scene:
     home, meta = "", recording.meta
     try:
         with TemporaryDirectory(prefix="hapticbridge-") as folder:
-            main = unpack_scene(recording, Path(folder))
+            main = unpack_scene(recording.path, recording.attachments, Path(folder))
             home = f"{main.parent}/"
             is_carried = meta.get("tool_weight") == CARRIED
             scene = load_unpacked(main, request_of(meta), is_carried=is_carried)

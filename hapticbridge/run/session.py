@@ -67,6 +67,8 @@ from hapticbridge.run.options import RunSetup
 from hapticbridge.run.request import RunRequest
 from hapticbridge.run.slow_scene import MAX_WAIT, SlowScene
 from hapticbridge.run.summary import RunOutcome, Summary, hand_energy
+from hapticbridge.run.unpacked import warn_of_other_scene
+from hapticbridge.scene import Scene
 from hapticbridge.scene.checks import first_pump, strongest_actuator
 from hapticbridge.scene.inputs import Write
 from hapticbridge.signals import deferring_stops
@@ -283,7 +285,9 @@ class Session:
         resources.callback(self._release_scene)
         if not setup.tool_weight and not scene.is_carried:
             scene.carry_tool("--no-tool-weight")
-        effective = self._prepare()
+        effective = self._prepare(scene)
+        if self.output.path is not None:
+            warn_of_other_scene(scene, self._request, self.output.path, self._prepare)
         with deferring_stops():
             self._snapshot = None if self.output.observer is None else Snapshot.shared(scene.model)
             if self._snapshot is not None:
@@ -332,10 +336,10 @@ class Session:
         period = CHECK_PERIOD if self._snapshot is None else PICTURE_PERIOD
         self._chore_ticks = max(round(period / setup.period), 1)
 
-    def _prepare(self) -> Coupling | None:
-        """Prepares the scene; returns the measured coupling of a weld."""
-        setup, scene = self.setup, self.setup.scene
-        if not self.setup.scene.has_several_hands:
+    def _prepare(self, scene: Scene) -> Coupling | None:
+        """Prepares the scene, or the same from its recording; returns a weld's coupling."""
+        setup = self.setup
+        if not scene.has_several_hands:
             pace = setup.scene_period, setup.substeps
             return prepare(scene, setup.coupling, *pace, setup.method)
         self._update_scenes()  # the model may have been replaced since they were resolved

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.recorded_scene import unpack_scene
 from hapticbridge.demand.guard import USUAL_RAMP
 from hapticbridge.demand.trip import Trip
 from hapticbridge.device import DeviceInfo
@@ -23,6 +22,7 @@ from hapticbridge.run.description import parameters_of
 from hapticbridge.run.hands import GripAxis
 from hapticbridge.run.options import BridgeOptions, RunSetup
 from hapticbridge.run.request import RunRequest, request_of, setups_of
+from hapticbridge.run.unpacked import unpack_scene
 from hapticbridge.whatif.settings import Settings
 
 
@@ -55,7 +55,7 @@ class RecordedRun:
         Raises:
             RecordingError: The recording does not describe its run, or carries no scene.
         """
-        scene_file = unpack_scene(hands[0], folder)
+        scene_file = unpack_scene(hands[0].path, hands[0].attachments, folder)
         request, setups = request_of(hands[0].meta), setups_of(hands[0].meta)
         return tuple(
             cls(

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.audit.recorded_scene import load_unpacked
 from hapticbridge.clock import Clock, SimulatedClock
 from hapticbridge.demand.loop_setting import delay_ticks
 from hapticbridge.demand.trip import TripCode
@@ -31,6 +30,7 @@ from hapticbridge.run.commands import CHANGES as COMMANDED
 from hapticbridge.run.commands import concerns, coupling_in, tuning_ticks
 from hapticbridge.run.description import CARRIED, sample_at
 from hapticbridge.run.hands import Grasp
+from hapticbridge.run.unpacked import load_unpacked
 from hapticbridge.scene import Scene
 from hapticbridge.whatif.recorded import RecordedRun, changed_request
 from hapticbridge.whatif.settings import GAINS, Settings
