@@ -547,6 +547,23 @@ def test_one_hand_that_is_named_is_as_today(
 
 
 @pytest.mark.parametrize(
+    "name",
+    ["left/pinch", "a=b", "a=simulated", "a+b", "a@1,2", "größe 1", "--help", "..", "x" * 300],
+)
+def test_any_name_of_a_scene_can_be_a_hand_of_two(tmp_path: Path, name: str) -> None:
+    ball = '<body pos="{} 0 0.1"><freejoint/><geom size="0.02" mass="0.1"/><site name="{}"/></body>'
+    balls = ball.format(0, name) + ball.format(0.2, f"{name}2")
+    scene = tmp_path / "balls.xml"
+    option = '<option gravity="0 0 0"/>'
+    scene.write_text(f"<mujoco>{option}<worldbody>{balls}</worldbody></mujoco>", encoding="utf-8")
+    record = tmp_path / "run.mcap"
+    hands = (f"--hand={each}=simulated:damping=3" for each in (name, f"{name}2"))
+    arguments = ["run", str(scene), *hands, "--fast", "--duration", "0.1", "--record", str(record)]
+    assert main(arguments) == 0
+    assert hb.audit(record).hands == (name, f"{name}2")
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("--hand", "left"), "--hand is 'left'; it must be GRIP=DEVICE"),

@@ -12,6 +12,7 @@ from pathlib import Path
 from signal import Signals
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import mujoco
 import numpy as np
 from rich.markup import escape
 
@@ -31,6 +32,7 @@ from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.base import checked_close
 from hapticbridge.device.mouse import MouseDevice
+from hapticbridge.device.registry import is_device
 from hapticbridge.device.trajectory import DEFAULT_SECONDS
 from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, choices
 from hapticbridge.kernel.parameters import RunParameters
@@ -334,7 +336,8 @@ class Run:
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         clock = SimulatedClock() if self.fast else RealClock()
-        held = self._held()
+        if self.hand and (self.grip != "grip" or self.device != "simulated"):
+            raise HapticBridgeError("--hand GRIP=DEVICE takes the place of --grip and --device")
         refuse_simulated_time(self.device, clock)  # before the user is asked to home it
         if self.port is not None and not self._is_viewed:
             raise HapticBridgeError("--port without --view has no effect")
@@ -343,8 +346,8 @@ class Run:
             interrupts = stack.enter_context(interrupting_on_signals())
             with err.status("reading the scene …"):
                 source = read_scene(self.scene, **settings_from(self.settings))
+            held = self._completed(self._held(source.spec), own_grips(source))
             prepare_run(lambda left: notify(words(left)))
-            held = self._completed(held, own_grips(source))
             if len(held) > 1:
                 return self._run_hands(source, held, clock, stack, window, interrupts)
             if held:
@@ -424,16 +427,19 @@ class Run:
         """Returns the run of several hands, each of which has the buttons in its grasp."""
         return self._with(clutch=None, dead_man=None)
 
-    def _held(self) -> list[tuple[str, str, str]]:
-        """Returns grip, joint of the grip axis (may be empty) and device of each --hand."""
-        if not self.hand:
-            return []
-        if self.grip != "grip" or self.device != "simulated":
-            raise HapticBridgeError("--hand GRIP=DEVICE takes the place of --grip and --device")
+    def _held(self, spec: mujoco.MjSpec) -> list[tuple[str, str, str]]:
+        """Returns grip, joint of the grip axis (may be empty) and device of each --hand.
+
+        A name of the scene may hold ``=`` and ``+``.
+        """
         held = []
+        names = {each.name for each in (*spec.sites, *spec.bodies)}
         for each in self.hand:
-            grip, _, device = each.partition("=")
-            grip, _, joint = grip.partition("+")
+            parts = each.split("=")
+            pairs = [("=".join(parts[:i]), "=".join(parts[i:])) for i in range(1, len(parts))]
+            known = (pair for pair in pairs if is_device(pair[1]))
+            grip, device = next(known, pairs[0] if pairs else ("", ""))
+            grip, joint = (grip, "") if grip in names else grip.partition("+")[::2]
             if not grip or not device:
                 raise HapticBridgeError(f"--hand is {each!r}; it must be GRIP=DEVICE")
             held.append((grip, joint, device))

@@ -16,6 +16,7 @@ To add a driver to this tree (``hapticbridge guide device-package`` adds one fro
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -76,6 +77,12 @@ def is_own(name: str) -> bool:
 def is_driver(name: str) -> bool:
     """Returns whether a name is that of a hardware driver, own or installed; imports none."""
     return name in DRIVERS or (not is_own(name) and name in installed_drivers())
+
+
+def is_device(spec: str) -> bool:
+    """Returns whether a specification begins with the name of a device; imports none."""
+    name = spec.partition(":")[0]
+    return is_own(name) or is_driver(name)
 
 
 def driver_named(name: str) -> Driver | None:
@@ -300,6 +307,16 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
     return _OPENERS[name](rest, options)
 
 
+def _motion_beside(scene: Scene, part: str) -> Path | None:
+    """Returns the motion ``NAME.csv`` or ``NAME_PART.csv`` beside a scene, or None.
+
+    A slash in a name, as those of attached parts have, is an underscore in the file's.
+    """
+    name = "_".join(filter(None, (scene.name, part))).replace("/", "_")
+    path = scene.path.parent / f"{name}.csv"
+    return path if os.path.isfile(path) else None  # noqa: PTH113 - a name may be too long
+
+
 def device_for(
     scene: Scene, spec: str, notify: Notify = ignore_message, grip_axis: str = ""
 ) -> Device:
@@ -328,18 +345,16 @@ def device_for(
             )
     others = [each for each in scene.other_grips if each != str(Grip(grip_axis, "joint"))]
     grip = Grip.from_text(scene.grip).name
-    path = scene.path.with_name(f"{scene.name}_{grip}.csv" if others else f"{scene.name}.csv")
-    if path.is_file():
+    if path := _motion_beside(scene, grip if others else ""):
         options["path"] = path
     device = open_device(spec, notify=notify, **options)
     if not grip_axis:
         return device
-    path = scene.path.with_name(f"{scene.name}_{grip_axis}.csv")
     fingers = SimulatedDevice(
         mass=GRIP_AXIS[0],
         damping=GRIP_AXIS[1],
         hand=FINGERS_HAND,
-        path=path if path.is_file() else None,
+        path=_motion_beside(scene, grip_axis),
         force_limit=GRIP_AXIS[2],
         dof=3,
     )
