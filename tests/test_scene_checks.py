@@ -65,8 +65,6 @@ def test_a_file_goes_before_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (mjcf("<size memory='1P'/>"), ["memory", "<size>"]),
         # what switches the coupling off or cannot be simulated again
         (mjcf("<option><flag ipc='enable'/></option>"), ["flag ipc", "disable it"]),
-        (mjcf("<option><flag actuation='disable'/></option>"), ["actuation", "enable it"]),
-        (mjcf("<option actuatorgroupdisable='30 0 4'/>"), ["0, 4, 30", "remove actuatorgr"]),
     ],
 )
 def test_unreadable_file_is_told_with_line(tmp_path: Path, text: str, words: list[str]) -> None:

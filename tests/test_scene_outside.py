@@ -525,3 +525,47 @@ def test_the_force_of_a_servo_is_not_taken_for_the_weight_of_the_tool(tmp_path: 
         assert 1.0 < weight / (0.11 * 9.81) < 2.0  # the first swing included, damped
         assert holding_force(scene, parameters) > 10.0
         assert np.array_equal(scene.model.actuator_forcelimited, limits)
+
+
+ARM = """<body name="arm" pos="0.3 0 0"><joint name="j" axis="0 0 1" damping="0.1"/>
+<geom type="capsule" fromto="0 0 0 0.1 0 0" size="0.01"/></body>"""
+MOTORS = """<actuator><position name="near" joint="j" kp="1" group="0"/>
+<motor name="push" joint="j" group="1"/>
+<motor name="high" joint="j" group="40"/></actuator>"""
+
+
+@pytest.mark.parametrize(
+    ("option", "active"),
+    [
+        ("<option gravity='0 0 0'/>", (1, 1, 1)),
+        ("<option gravity='0 0 0' actuatorgroupdisable='1'/>", (1, 0, 1)),
+        (
+            f"<option gravity='0 0 0' actuatorgroupdisable='{' '.join(map(str, range(31)))}'/>",
+            (0, 0, 1),
+        ),
+        ("<option gravity='0 0 0'><flag actuation='disable'/></option>", (0, 0, 0)),
+    ],
+)
+def test_actuators_that_a_scene_disables_stay_so_and_the_hand_is_felt(
+    tmp_path: Path, option: str, active: tuple[int, ...]
+) -> None:
+    path = scene_file(
+        tmp_path, outside.mjcf(option, world=ARM).replace("</mujoco>", f"{MOTORS}</mujoco>")
+    )
+    scene = hb.load_scene(path)
+    hand = hb.open_device(f"trajectory:{hand_file(tmp_path, [(0.5, (0.02, 0, 0))])}")
+    record = tmp_path / "run.mcap"
+    with hb.Bridge(scene, hand, clock=hb.SimulatedClock(), recording=record) as bridge:
+        bridge.set_input(ctrl={"near": 0.3, "push": 0.01, "high": 0.02})
+        bridge.run(duration=0.4)
+        forces = scene.data.actuator_force[:3].copy()
+        ticks = bridge.latest_records(400)
+    plain = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(plain)
+    data.qpos[:], data.qvel[:] = scene.data.qpos, scene.data.qvel
+    data.ctrl[:] = 0.3, 0.01, 0.02
+    mujoco.mj_forward(plain, data)
+    assert (forces != 0.0).tolist() == [bool(each) for each in active]
+    np.testing.assert_allclose(forces, data.actuator_force, atol=2e-3)
+    assert ticks["tool_position"][-1, 0] - ticks["tool_position"][0, 0] > 0.01
+    assert hb.audit(record).resimulation == "bit for bit"

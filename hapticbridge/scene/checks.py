@@ -238,23 +238,13 @@ def check_options(spec: mujoco.MjSpec) -> list[str]:
     """Refuses options that are incompatible with the coupling; returns warnings.
 
     Raises:
-        SceneError: An option has state that is not saved (ipc), or disables actuators.
+        SceneError: An option has state that is not saved (ipc).
     """
     option = spec.option
     if option.enableflags & mujoco.mjtEnableBit.mjENBL_IPC:
         raise SceneError(
             "the scene enables flag ipc, whose state cannot be saved and simulated again; "
             "disable it"
-        )
-    if option.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
-        raise SceneError(
-            "the scene disables actuation, and the coupling is made of actuators; enable it"
-        )
-    if option.disableactuator:
-        groups = [str(g) for g in range(31) if option.disableactuator & (1 << g)]
-        raise SceneError(
-            f"the scene disables actuator groups ({', '.join(groups)}), which could switch the "
-            "coupling off; remove actuatorgroupdisable"
         )
     warnings = []
     if np.any(np.asarray(option.wind)):

@@ -240,6 +240,10 @@ def _attach_handle(spec: mujoco.MjSpec, name: str) -> None:
     body.name = body.sites[0].name = name
 
 
+GROUPS = 31
+"""Actuator groups that a scene can disable, from 0; those of higher groups always act."""
+
+
 def _bare_actuator(spec: mujoco.MjSpec, name: str, axis: int) -> mujoco.MjsActuator:
     """Adds an actuator with every field set, so that no <default> of the scene applies.
 
@@ -257,8 +261,10 @@ def _bare_actuator(spec: mujoco.MjSpec, name: str, axis: int) -> mujoco.MjsActua
         setattr(actuator, field, np.zeros(2))
     for field in ("cranklength", "inheritrange", "delay", "armature"):
         setattr(actuator, field, 0.0)
-    for field in ("nsample", "interp", "group", "ctrlspec"):
+    for field in ("nsample", "interp", "ctrlspec"):
         setattr(actuator, field, 0)
+    disabled = int(spec.option.disableactuator)
+    actuator.group = next(g for g in range(GROUPS + 1) if not disabled >> g & 1)
     actuator.damping = np.zeros(3)
     return actuator
 
@@ -301,6 +307,15 @@ def set_options(spec: mujoco.MjSpec, *, as_is: bool = False) -> tuple[SceneChang
     if (integrator := int(option.integrator)) != mujoco.mjtIntegrator.mjINT_DISCRETE:
         words = f"integrator: {_INTEGRATORS[integrator]} → the method's"
         changes.append(SceneChange(words, "integrator"))
+    if option.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
+        # the coupling is made of actuators: the scene's own are disabled by their groups instead
+        option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+        option.disableactuator = (1 << GROUPS) - 1
+        for each in spec.actuators:
+            each.group = min(each.group, GROUPS - 1)
+    if spec.compiler.LRopt.mode == mujoco.mjtLRMode.mjLRMODE_ALL:
+        # the coupling has no range of lengths, and only muscles and plugins compute with theirs
+        spec.compiler.LRopt.mode = mujoco.mjtLRMode.mjLRMODE_MUSCLEUSER
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.noslip_iterations = 0

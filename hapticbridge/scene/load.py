@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -241,9 +241,16 @@ def _written(source: SceneSource) -> SceneSource:
 
 
 def plain_model(source: SceneSource) -> mujoco.MjModel:
-    """Compiles a scene without handle and coupling, so that it needs no grip."""
+    """Compiles a scene without handle and coupling, so that it needs no grip.
+
+    An integrator that MuJoCo refuses for this scene is replaced, as the bridge does.
+    """
+    spec = source.spec.copy()
+    with suppress(ValueError):
+        return spec.compile()
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     with _refused(source.path):
-        return source.spec.copy().compile()
+        return spec.compile()
 
 
 MIN_MEMORY = 13 << 20
@@ -282,10 +289,10 @@ def compile_scene(
     grips = (grip,) if isinstance(grip, str) else tuple(grip)
     if not grips:
         raise SceneError(f"no grip is named for scene '{path}'; name one per hand")
+    changes = set_options(spec, as_is=as_is)
     with _refused(path):
         about_grip = [said for each in grips for said in add_grip(spec, each)]
     attach_handles(spec, grips)
-    changes = set_options(spec, as_is=as_is)
     with _refused(path):
         model = spec.compile()
         if model.narena < MIN_MEMORY:
