@@ -11,6 +11,7 @@ import mujoco
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from outside_scenes import scene_file
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import prepare
@@ -22,6 +23,7 @@ from hapticbridge.scene.contacts import (
     check_contacts,
     contact_concerns,
     contact_numbers,
+    restitution,
 )
 
 H = 1e-3
@@ -372,3 +374,51 @@ def test_settings_are_mujocos(geoms: list[dict[str, object]], flag: str, more: s
     assert found.keys() == expected.keys()
     for key, values in expected.items():
         assert found[key] == pytest.approx(values)
+
+
+BOUNCER = """<mujoco><option timestep="1e-4" gravity="0 0 0"/><worldbody>
+<geom name="floor" type="plane" size="1 1 .1" solmix="0"/>
+<body name="tool" pos="0 0 0.011"><freejoint/>
+<geom name="ball" size="0.01" mass="0.1" {}/><site name="grip"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("solref", "expected"),
+    [
+        ((-4000.0, -10.0), 0.79),
+        ((0.01, 0.1), 0.74),
+        ((0.02, 1.0), 0.135),
+        ((-1000.0, -100.0), 0.064),
+    ],
+)
+def test_restitution_is_what_mujoco_gives_a_ball(
+    tmp_path: Path, solref: tuple[float, float], expected: float
+) -> None:
+    setting = f'solref="{solref[0]} {solref[1]}" solimp="0.9999 0.9999 0.001"'
+    model = mujoco.MjModel.from_xml_string(BOUNCER.format(setting))
+    data = mujoco.MjData(model)
+    data.qvel[2] = -0.2
+    mujoco.mj_step(model, data, 4000)
+    assert restitution(solref) == pytest.approx(expected, abs=0.01)
+    assert data.qvel[2] / 0.2 == pytest.approx(restitution(solref), abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ('margin="0.005"', "contacts of geom 'ball': from 5 mm apart → on touch"),
+        ('solref="-4000 -10"', "bounce of geom 'ball': e = 0.79 → 0"),
+        ('margin="1e-5" solref="0.005 1"', ""),
+        ('margin="0.005" contype="0" conaffinity="0"', ""),
+    ],
+)
+def test_margins_and_bounces_that_rigid_contacts_lack_are_said(
+    tmp_path: Path, setting: str, said: str
+) -> None:
+    scene = load_scene(scene_file(tmp_path, BOUNCER.format(setting)))
+    before = scene.changes
+    scene.set_contact(is_rigid=True)
+    more = [each for each in scene.changes if each not in before]
+    assert more == ([f"{said} (--contact scene keeps it)"] if said else [])
+    scene.set_contact(is_rigid=False)
+    assert scene.changes == before

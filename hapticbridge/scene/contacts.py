@@ -181,7 +181,63 @@ SOFT_FREQUENCY = 15.0
 holds at 24 Hz. A hand moves at up to 10 Hz, and would feel a softer one yield."""
 
 
-def announce_soft_equalities(model: mujoco.MjModel) -> tuple[SceneChange, ...]:
+def announce_rigid(model: mujoco.MjModel, margins: NDArray[np.float64]) -> tuple[SceneChange, ...]:
+    """Returns what rigid contacts and constraints change in a scene, each as ``name: old → new``.
+
+    Args:
+        model: The compiled scene.
+        margins: Margin in m of each geom in its file, (ngeom,).
+    """
+    touches = (model.geom_contype | model.geom_conaffinity) != 0
+    wide = np.where(touches & (margins >= NOTABLE_MARGIN), margins, 0.0)
+    bounces = np.where(touches, [restitution(each) for each in model.geom_solref], 0.0)
+    bounces[bounces < NOTABLE_BOUNCE] = 0.0
+    said = (
+        (wide, "contacts of", f"from {1e3 * wide.max(initial=0.0):.3g} mm apart → on touch"),
+        (bounces, "bounce of", f"e = {bounces.max(initial=0.0):.2g} → 0"),
+    )
+    changes = [
+        SceneChange(f"{what} {_listed(model, values)}: {words} (--contact scene keeps it)")
+        for values, what, words in said
+        if values.any()
+    ]
+    return (*_soft_equalities(model), *changes)
+
+
+NOTABLE_MARGIN, NOTABLE_BOUNCE = 1e-4, 0.2
+"""Margin in m, and coefficient of restitution, below which a rigid contact is not said to differ
+from the file's. Bodies in default contact bounce with 0.14."""
+
+
+def _listed(model: mujoco.MjModel, values: NDArray[np.float64]) -> str:
+    """Returns the name of the geom with the largest value, and the number of others."""
+    others = np.count_nonzero(values) - 1
+    first = geom_name(model, int(values.argmax()))
+    return f"{first} and {others} more" if others else first
+
+
+def restitution(solref: Sequence[float]) -> float:
+    """Returns MuJoCo's coefficient of restitution of a contact, from 0 to 1.
+
+    A spring and damper that only push let go where their force is zero, before the spring is at
+    rest: e = exp(−ζ φ/s) with s = √(1 − ζ²), φ = atan2(2ζs, 2ζ² − 1); for ζ > 1 with s = √(ζ² − 1),
+    φ = artanh(2ζs/(2ζ² − 1)). Critical damping, MuJoCo's default, has e = exp(−2) = 0.14.
+
+    Args:
+        solref: MuJoCo's (time constant in s, damping ratio ζ), or (−k, −b) with ζ = b/(2√k).
+    """
+    first, second = float(solref[0]), float(solref[1])
+    ratio = second if first > 0.0 else -second / (2.0 * math.sqrt(-first)) if first else 1.0
+    ratio = max(ratio, 0.0)
+    root = math.sqrt(abs(1.0 - ratio**2))
+    if root < 1e-6:
+        return math.exp(-2.0)
+    twice, rest = 2.0 * ratio * root, 2.0 * ratio**2 - 1.0
+    angle = math.atan2(twice, rest) if ratio < 1.0 else math.atanh(twice / rest)
+    return math.exp(-ratio / root * angle)
+
+
+def _soft_equalities(model: mujoco.MjModel) -> tuple[SceneChange, ...]:
     """Returns a sentence on equality constraints that rigid ones replace, as ``name: old → new``.
 
     An equality holds a mass with ω² = κ/h² (κ of the module's first equation), so softly below

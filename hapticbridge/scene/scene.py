@@ -25,7 +25,7 @@ from hapticbridge.kernel.mujoco_c import warning_of
 from hapticbridge.kernel.pose import IDENTITY_POSE
 from hapticbridge.kernel.rigid_contact import IMPRATIO, MARGIN, MAX_MARGIN, largest_margin
 from hapticbridge.scene.compile import SceneChange, clause, go_to_start
-from hapticbridge.scene.contacts import announce_soft_equalities
+from hapticbridge.scene.contacts import announce_rigid
 from hapticbridge.scene.handle import (
     add_weld,
     carry_over,
@@ -223,7 +223,7 @@ class Scene:
         if is_rigid == bool(own):
             self._set_margins()
             return
-        said = announce_soft_equalities(model)
+        said = announce_rigid(model, own.get("geom_margin", model.geom_margin))
         self.differences = tuple(each for each in self.differences if each not in said)
         if not is_rigid:
             self._restore_contact(model)
