@@ -15,6 +15,7 @@ from hapticbridge.audit import audit as audit  # beside it stands the package of
 from hapticbridge.lazy import lazy_exports
 
 if TYPE_CHECKING:
+    __version__: str
     from hapticbridge import theory as theory
     from hapticbridge.audit import AuditReport as AuditReport
     from hapticbridge.clock import RealClock as RealClock

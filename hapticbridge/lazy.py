@@ -10,6 +10,7 @@ import ast
 import sys
 from collections.abc import Callable
 from importlib import import_module
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -41,6 +42,8 @@ def lazy_exports(
     names = sorted({*places, *present})
 
     def find(name: str) -> object:
+        if name == "__version__":
+            return version(package)
         place, attribute = places.get(name, (package, name))
         if name not in places and (name.startswith("__") or not find_spec(f"{package}.{name}")):
             raise AttributeError(f"module {package!r} has no attribute {name!r}")

@@ -79,6 +79,14 @@ def test_it_says_what_a_class_states_and_as_how_many_ticks_a_delay_counts(
     assert read_profile(former).quantities["delay"].value == pytest.approx(3e-3)
 
 
+def test_the_hand_of_a_simulated_device_lets_go(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--axes", "x", "--duration", "5"]
+    assert main(["identify", "simulated:damping=3", *words]) == 0
+    assert "the simulated hand lets go of the device" in capsys.readouterr().err
+    assert main(["identify", "simulated:damping=3,hand_mass=0.5", *words]) == 2
+    assert "let go of it" in capsys.readouterr().err
+
+
 def test_what_was_measured_before_gives_way_to_a_new_measurement() -> None:
     device = open_device(f"{FREE},delay=5")
     result = identify(device, SimulatedClock(), period=1e-3, axes=("x",), duration=5.0)

@@ -42,6 +42,19 @@ def test_a_run_that_is_repeated_is_the_same_run(tap: Path, tmp_path: Path, call:
     assert (code, "equal in every bit" in out) == (0, True)
 
 
+def test_a_quaternion_and_its_opposite_are_one_orientation(tap: Path, tmp_path: Path) -> None:
+    def change(rows: NDArray[np.void]) -> None:
+        rows["tool_quaternion"][20:40] *= -1.0
+        rows["tool_quaternion"][30, 1] += 1e-3
+
+    found = compare(tap, changed(tap, tmp_path, change))
+    assert found.first is not None
+    assert (found.first.column, found.first.ticks) == ("tool_quaternion_x", (30, 30))
+    assert [(each.column, round(each.size, 9)) for each in found.largest] == [
+        ("tool_quaternion_x", 1e-3)
+    ]
+
+
 @pytest.mark.parametrize("block", [16, 1000])
 def test_first_and_largest_difference_are_told(
     block: int, tap: Path, tmp_path: Path, call: Called, monkeypatch: pytest.MonkeyPatch

@@ -106,6 +106,17 @@ TURNED = "t,x,y,z,qw,qx,qy,qz\n"
 
 
 @pytest.mark.parametrize(
+    "text",
+    ["t;x;y;z\n0;0;0;0\n0,5;0,01;-1e-3;0\n", "t\tx\ty\tz\n0\t0\t0\t0\n.5\t.01\t-.001\t0\n"],
+    ids=["semicolons and decimal commas", "tabs"],
+)
+def test_columns_may_be_separated_as_other_programs_do(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "motion.csv"
+    file.write_text(text, encoding="utf-8")
+    assert read_motion(file).table[1, :4].tolist() == [0.5, 0.01, -0.001, 0.0]
+
+
+@pytest.mark.parametrize(
     ("text", "words"),
     [
         ("", "the file is empty; it needs a header t,x,y,z and two rows"),

@@ -245,6 +245,14 @@ class Identify:
     as_json: bool = option(False, flag="json")
     """Print the result as JSON."""
 
+    def _unheld(self) -> str:
+        """Returns the device's specification; the hand of a simulated one lets go, as it must."""
+        name, _, rest = self.device.partition(":")
+        if name != "simulated" or "hand" in rest:
+            return self.device
+        notify("the simulated hand lets go of the device, as a person has to (hand=none)")
+        return f"simulated:{','.join(filter(None, (rest, 'hand=none')))}"
+
     def execute(self) -> int:
         """Measures and prints; returns the exit code."""
         check_ending(self.plot)
@@ -253,7 +261,7 @@ class Identify:
         duration = duration_at(period) if self.duration is None else self.duration
         if self.plot is not None and self.plot == self.zwidth:
             raise HapticBridgeError(f"--plot and --zwidth both name '{self.plot}'")
-        device = open_device(self.device, notify=notify)
+        device = open_device(self._unheld(), notify=notify)
         try:
             axes = self._axes(device.info.axes)
             clock = RealClock() if device.info.is_real else SimulatedClock()

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -302,7 +303,8 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
     if name not in _OPENERS:
         names = [*_OPENERS, *DRIVERS, *installed_drivers()]
         raise DeviceError(
-            f"unknown device '{name}'; {nearest(name, names)}choose one of {choices(names)}"
+            f"unknown device '{name}'; {_meant(name) or nearest(name, names)}choose one of "
+            f"{choices(names)}"
         )
     return _OPENERS[name](rest, options)
 
@@ -315,6 +317,16 @@ def _motion_beside(scene: Scene, part: str) -> Path | None:
     name = "_".join(filter(None, (scene.name, part))).replace("/", "_")
     path = scene.path.parent / f"{name}.csv"
     return path if os.path.isfile(path) else None  # noqa: PTH113 - a name may be too long
+
+
+def _meant(product: str) -> str:
+    """Asks for the device that opens a maker's product, as 'haply' an 'Inverse3'; else empty."""
+    asked = re.findall(r"[a-z]{4,}", product.lower())
+    for driver in filter(None, map(driver_named, DRIVERS)):
+        sold = (driver.about.partition(" through ")[0], *(each.model for each in driver.ids))
+        if set(asked[:1]) & set(re.findall(r"[a-z]{4,}", " ".join(sold).lower())):
+            return f"did you mean '{driver.name}' ({driver.about})? "
+    return ""
 
 
 def device_for(

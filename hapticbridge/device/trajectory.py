@@ -242,7 +242,8 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
 
     The first line that is neither empty nor a comment (``#``) names the columns, in any order:
     ``t,x,y,z`` in s and m, and either all or none of ``qw,qx,qy,qz``. Every further line is a row
-    of numbers. Times must strictly increase; the rate is free.
+    of numbers. Times must strictly increase; the rate is free. Semicolons, beside which a number
+    may have a decimal comma, or tabs may stand in the place of commas.
 
     Args:
         path: The file, UTF-8.
@@ -263,12 +264,13 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
     header = next(numbered, None)
     if header is None:
         raise DeviceError(f"{path}: the file is empty; it needs a header t,x,y,z and two rows")
-    names = _column_names(f"{path}, line {header[0]}", header[1])
+    with_commas = _COMMAS[next((each for each in _COMMAS if each in header[1]), "\t")]
+    names = _column_names(f"{path}, line {header[0]}", header[1].translate(with_commas))
     width = len(names)
     numbers: list[int] = []
     values: list[float] = []
     for number, line in numbered:
-        fields = line.split(",")
+        fields = line.translate(with_commas).split(",")
         if len(fields) != width:
             raise DeviceError(
                 f"{path}, line {number}: {len(fields)} fields where the header names "
@@ -298,6 +300,10 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
     if fault := first_fault(table):
         raise DeviceError(f"{path}, line {numbers[fault[0]]}: {fault[1]}")
     return Motion(table[:, 0], table[:, 1:4], table[:, 4:])
+
+
+_COMMAS = {";": {ord(";"): ",", ord(","): "."}, ",": dict[int, str](), "\t": {ord("\t"): ","}}
+"""Characters to replace in a line, by the character that separates the columns in its header."""
 
 
 def _read_lines(path: Path) -> list[str]:

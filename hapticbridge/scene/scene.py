@@ -77,7 +77,7 @@ def _widen_bodies(model: mujoco.MjModel, more: float) -> None:
     np.maximum.at(model.body_margin, model.geom_bodyid, reach)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, repr=False)
 class Scene:
     """A compiled scene with its handle, ready to be stepped.
 
@@ -115,6 +115,10 @@ class Scene:
     _reach: float = 0.0
     _period: float = 0.0
     _own_contact: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        bodies, freedom = self.model.nbody - 1, self.model.nv
+        return f"<Scene '{self.name}' held at '{self.grip}', {bodies} bodies, {freedom} freedoms>"
 
     @property
     def changes(self) -> tuple[str, ...]:

@@ -247,6 +247,7 @@ class _Found:
         self.compared += len(a)
         earliest: tuple[int, Difference] | None = None
         both = set(b.dtype.names or ()) - set(CLOCK_FIELDS)
+        b = _with_nearest_quaternions(a, b)
         for column in columns_of(a.dtype):
             if column.field not in both:
                 continue
@@ -274,6 +275,17 @@ class _Found:
         values = _numbers(a, column)[at].item(), _numbers(b, column)[at].item()
         time = ticks[0] * self._periods[0]
         return Difference(time, ticks, column.name + self._of_hand, column.unit, values)
+
+
+def _with_nearest_quaternions(a: NDArray[np.void], b: NDArray[np.void]) -> NDArray[np.void]:
+    """Returns b with the one of q and −q, which are one orientation, that is nearer to a's."""
+    for name in sorted(set(a.dtype.names or ()) & set(b.dtype.names or ())):
+        if name.endswith("_quaternion"):
+            is_other = (a[name] * b[name]).sum(axis=1) < 0.0
+            if is_other.any():
+                b = b.copy()
+                b[name][is_other] *= -1.0
+    return b
 
 
 def _numbers(ticks: NDArray[np.void], column: Column) -> NDArray[np.int64 | np.float64]:

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -400,7 +401,9 @@ def medium() -> str:
     system = Linux()
     nodes = system.nodes()
     if not nodes:
-        return "no input devices are seen: only Linux offers force feedback through /dev/input"
+        if sys.platform != "linux":
+            return "only Linux offers force feedback through /dev/input"
+        return "no input devices are seen in /dev/input"
     closed = [path for path in nodes if not os.access(path, os.R_OK | os.W_OK)]
     if not closed:
         return f"{len(nodes)} input devices may be opened"

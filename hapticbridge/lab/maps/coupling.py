@@ -326,8 +326,8 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
     )
     for name, selected in methods.items():
         yield (
-            "'{name}' is stable and passive at {passive_share_below_6:.0%} of the {runs_below_6} "
-            "points below (6); the hand that taps finds the environment at fault at "
+            "'{name}' is stable and passive in {passive_share_below_6:.0%} of the runs below (6), "
+            "{runs_below_6} in number; the hand that taps finds the environment at fault at "
             "{environment_faults_below_6}, the device at {device_faults_below_6}, and at most "
             "{max_slack_used_below_6:.0%} of the slack used",
             selected | {"name": name},
