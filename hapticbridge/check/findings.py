@@ -51,7 +51,6 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             f"one step per tick at {1 / case.period:g} Hz, and its contacts change with it",
             f"{places.option_change('timestep', f'{case.period:g}')}, or check with --rate "
             f"{1 / step:g}",
-            is_note=True,
         )
     for change in case.scene.differences:
         if not change.kind:  # those of a kind have a fault of their own
@@ -60,7 +59,6 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
                 places.option("integrator"),
                 f"the scene runs with a change, {change}",
                 "run --as-is, which refuses the scene",
-                is_note=True,
             )
     found = (
         ("wind", case.source.concerns),

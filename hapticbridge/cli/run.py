@@ -16,7 +16,15 @@ import numpy as np
 from rich.markup import escape
 
 from hapticbridge.arguments import option, shared
-from hapticbridge.cli.terminal import compiling, err, notify, out, plain, print_json
+from hapticbridge.cli.terminal import (
+    compiling,
+    err,
+    notify,
+    out,
+    plain,
+    print_json,
+    working,
+)
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import (
@@ -341,7 +349,7 @@ class Run:
         window = self._window() if self._is_viewed else None
         with ExitStack() as stack:
             interrupts = stack.enter_context(interrupting_on_signals())
-            with err.status("reading the scene …"):
+            with working("reading the scene"):
                 source = read_scene(self.scene, **settings_from(self.settings))
             prepare_run(lambda left: notify(words(left)))
             held = self._completed(held, own_grips(source))
@@ -349,7 +357,7 @@ class Run:
                 return self._run_hands(source, held, clock, stack, window, interrupts)
             if held:
                 return self._alone(*held[0]).execute()
-            with err.status("trying the scene …"):
+            with working("trying the scene"):
                 with compiling(self.scene):
                     scene = compile_scene(source, self.grip, as_is=self.as_is)
                 self._warn_of_faults(source, scene)
@@ -371,7 +379,7 @@ class Run:
                     scene, [grasp], clock, stack, window, interrupts
                 )
             if self.options.substeps is None:
-                with err.status("trying the scene …"):
+                with working("trying the scene"):
                     chosen = chosen._with(substeps=chosen._own_substeps(source, scene))
             return chosen._feel(scene, device, clock, stack, window, interrupts)
 
@@ -481,7 +489,7 @@ class Run:
         if not axes:
             self._refuse_grip_scale()
         grips = check_grasps([Grasp(grip, grip_axis=axes.get(grip)) for grip, *_ in held])
-        with err.status("trying the scene …"), compiling(self.scene):
+        with working("trying the scene"), compiling(self.scene):
             scene = compile_scene(source, grips, as_is=self.as_is)
             self._warn_of_faults(source, scene)
         grasps, infos = [], []
@@ -558,7 +566,7 @@ class Run:
         if not self.as_json:
             for setup in bridge.setups:
                 announce(setup, self.coupling, is_method_chosen=options.method is not None)
-        with err.status("preparing …"):
+        with working("rehearsing the start of the run"):
             stack.enter_context(bridge)
         interrupts.hand_over(bridge.stop_on_signal)  # also while it closes: never cut short
         if window is not None:
