@@ -17,7 +17,7 @@ from hapticbridge.check.geometry_faults import grip_faults, mesh_faults, workspa
 from hapticbridge.check.mass_faults import mass_faults
 from hapticbridge.check.run_faults import run_faults
 from hapticbridge.errors import choices
-from hapticbridge.run.own_motion import own_motion
+from hapticbridge.run.fidelity import fidelity
 from hapticbridge.scene import compile_scene
 from hapticbridge.scene.checks import check_model, first_pump
 from hapticbridge.scene.compile import START_KEYFRAME
@@ -75,12 +75,17 @@ def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     if case.refused or first_pump(case.model) is not None:
         return  # the file's own scene does not compile, or a pump moves it without bound
     scene = compile_scene(case.source, case.scene.grip, warns=False, checks_start=False)
-    found = own_motion(case.source, scene, case.setting)
+    found = fidelity(case.source, scene, case.setting)
     place = case.places.option("timestep")
-    if found is not None and found.jnd > 1.0:
-        yield Fault("own motion", place, str(found), found.remedy(case.setting))
+    if found is not None and found.deviations:
+        change = found.advice(case.setting) or "nothing that was tried mends it"
+        yield Fault("own motion", place, str(found), change)
+    if found is not None and found.doubt:
+        change = "a shorter time step, with which the places no longer change"
+        yield Fault("time step matters", place, found.doubt, change)
     if found is not None and found.creation:
-        yield Fault("own motion", place, found.creation, "--contact rigid or --substeps")
+        kind = "energy in the slack" if case.is_rigid else "energy created"
+        yield Fault(kind, place, found.creation, "--contact rigid or --substeps")
 
 
 def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:

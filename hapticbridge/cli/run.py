@@ -44,6 +44,7 @@ from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, c
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
 from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.fidelity import NO_HAND, own_substeps
 from hapticbridge.run.hands import Grasp, GripAxis, check_grasps
 from hapticbridge.run.options import (
     AUTO,
@@ -54,7 +55,6 @@ from hapticbridge.run.options import (
     steady_rotational_stiffness,
     steady_stiffness,
 )
-from hapticbridge.run.own_motion import NO_HAND, own_substeps
 from hapticbridge.run.programs import prepare_run, words
 from hapticbridge.run.summary import WELD, Summary, coarse_spring, is_always_implicit
 from hapticbridge.scene import (
@@ -531,8 +531,8 @@ class Run:
                 f"{count} MuJoCo steps per tick keep the file's own time step, without which the "
                 "scene alone would move noticeably differently (--substeps 1 takes one)"
             )
-        elif moved is not None and moved.jnd > 1.0:
-            notify(f"{moved}; {moved.remedy(setting)}")
+        elif moved is not None and moved.deviations:
+            notify("; ".join(filter(None, (str(moved), moved.advice(setting)))))
         if moved is not None and moved.creation:
             notify(moved.creation)
         return count

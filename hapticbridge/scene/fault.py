@@ -51,6 +51,7 @@ FAILS = {
     "solver iterations": False,
     "starts in contact": False,
     "time step": False,
+    "time step matters": False,
     "visual geom with mass": False,
 }
 """Kinds of findings, and if a run fails with one. It fails if it does not start, diverges, gets
