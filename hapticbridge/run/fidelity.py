@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -130,7 +130,7 @@ class Fidelity:
     Attributes:
         deviations: Bodies that move differently in the bridge, that with the largest size first.
         incomparable: Bodies whose place the file itself does not determine.
-        bodies: Number of bodies that can move.
+        bodies: Number of bodies that can move while a hand holds the tool.
         step: The file's own time step in s.
         seconds: Time in s that was compared.
         created: Energy in J that the scene created meanwhile in the bridge.
@@ -226,7 +226,7 @@ def fidelity(
     with a body's centre of mass p under the file's own integrator, time step, solver and contacts,
     and q in the bridge. Both start as the run does, on the file's constraints, with its controls
     and without the mocap bodies that the hand replaces (``Scene.differences`` names both). A tool
-    that only such a body or nothing holds is held still in both, as by a hand.
+    that the file lets move by ``CHAOS`` without a motor is held in both, as by a hand at rest.
 
     A body deviates if its size is above 1 and above ``SPREAD`` times that between the file's motion
     and a second one of it, with half the time step and a start disturbed by ``DISTURBANCE``, and if
@@ -271,10 +271,7 @@ class _FileMotion:
     def simulate(cls, source: SceneSource, scene: Scene, max_work: float) -> Self | None:
         """Moves the scene; returns None if it diverges."""
         model = plain_model(source)
-        is_free = np.any(model.eq_active0 != scene.model.eq_active0[: model.neq])
         model.eq_active0[:] = scene.model.eq_active0[: model.neq]
-        held = _held_dofs(scene, is_free=bool(is_free))
-        _hold(model, held)
         data = mujoco.MjData(model)
         reset(model, data)
         scene.reset()
@@ -283,8 +280,13 @@ class _FileMotion:
         mujoco.mj_forward(model, data)
         most = max_work / max(model.nv + data.nefc, 1)
         count = max(int(min(round(SECONDS / model.opt.timestep), most)), 1)
-        end = _moved(model, data, count)
-        return None if end is None else cls(data, _places(copy.copy(data)), end, count, held)
+        start, end = _places(copy.copy(data)), _moved(model, data, count)
+        held = np.zeros(0, np.intp) if end is None else _loose_dofs(scene, start, end)
+        if held.size:
+            _hold(model, held)
+            mujoco.mj_forward(model, data)
+            end = _moved(model, data, count)
+        return None if end is None else cls(data, start, _places(end), count, held)
 
     @property
     def model(self) -> mujoco.MjModel:
@@ -316,8 +318,7 @@ class _FileMotion:
     def _compared(self, scene: Scene, setting: RunPoint) -> tuple[Places | None, Fidelity]:
         """Returns places in the bridge, None if it diverges, and what deviates."""
         created = self._moved_here(scene, replace(setting, coupling=NO_HAND))
-        bodies = int(np.count_nonzero(self.model.body_treeid >= 0))
-        found = Fidelity((), (), bodies, self.step, self.seconds, created)
+        found = Fidelity((), (), self._count_free(), self.step, self.seconds, created)
         if math.isinf(created):
             return None, replace(found, deviations=(Deviation("", math.inf, 0.0, math.inf),))
         here = self._places(scene.data)
@@ -339,6 +340,14 @@ class _FileMotion:
             incomparable=tuple(names[i] for i in worst if sizes[i] <= allowed[i]),
         )
 
+    def _count_free(self) -> int:
+        """Returns the number of bodies that can move while the tool is held."""
+        model, free = self.model, np.zeros(self.model.nbody, bool)
+        free[np.delete(model.dof_bodyid, self.held)] = True
+        for body in range(1, model.nbody):  # parents come first
+            free[body] |= free[model.body_parentid[body]]
+        return int(np.count_nonzero(free))
+
     def _spread(self) -> NDArray[np.float64]:
         """Returns the size of the difference to a second motion of the file, (nbody,)."""
         model = copy.copy(self.model)
@@ -348,7 +357,7 @@ class _FileMotion:
         other = _moved(model, self.data, 2 * self.count, step)
         if other is None:
             return np.full(model.nbody, math.inf)
-        return _size(other.apart(self.end))
+        return _size(_places(other).apart(self.end))
 
     def _settings(self, setting: RunPoint) -> Iterator[RunPoint]:
         """Yields settings of a run that undo one replacement or two."""
@@ -388,14 +397,15 @@ class _FileMotion:
             getattr(model, f"actuator_{name}")[list(added_actuators(model))] = 0.0
         _hold(model, self.held)
         scene.reset()
-        copy_values(self.model.opt, model.opt)
-        yield _moved(model, scene.data, self.count, places=self._places)
-        copy_values(scene.model.opt, model.opt)
-        model.opt.timestep = self.step
-        yield _moved(model, scene.data, self.count, places=self._places)
-        model.opt.timestep = own
-        count = max(round(self.seconds / own), 1)
-        yield _moved(model, scene.data, count, places=self._places)
+        for options, step in (
+            (self.model.opt, self.step),
+            (scene.model.opt, self.step),
+            (scene.model.opt, own),
+        ):
+            copy_values(options, model.opt)
+            model.opt.timestep = step
+            end = _moved(model, scene.data, max(round(self.seconds / step), 1))
+            yield None if end is None else self._places(end)
 
     def _places(self, data: mujoco.MjData) -> Places:
         """Returns the places of the file's bodies in a scene with handle."""
@@ -407,8 +417,9 @@ class _FileMotion:
         Returns:
             The energy in J that it created; inf if it diverges.
         """
+        parameters = rehearsal_parameters(scene, setting)
         _hold(scene.model, self.held)
-        binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, setting))
+        binding = BoundKernel(scene.model, scene.data, parameters)
         state, row, step = binding.state, binding.row, binding.step
         still, period = np.zeros(1, SAMPLE_DTYPE), setting.period
         still["quaternion"][:, 0] = 1.0
@@ -428,18 +439,16 @@ class _FileMotion:
             _hold(scene.model, self.held, by=-HELD)
 
 
-def _held_dofs(scene: Scene, *, is_free: bool) -> NDArray[np.intp]:
-    """Returns the degrees of freedom that move the body in each hand, if only the hand holds it.
-
-    ``is_free`` says so; a tool with a free joint is held by the hand alone, too.
-    """
-    model, held = scene.model, np.zeros(scene.model.nv, bool)
+def _loose_dofs(scene: Scene, start: Places, end: mujoco.MjData) -> NDArray[np.intp]:
+    """Returns the degrees of freedom that carry tools which fall or swing without a hand."""
+    found = np.zeros(0, np.intp)
+    sizes = _size(_places(copy.copy(end)).apart(start))
     for grip in (scene.grip, *scene.other_grips):
-        dofs = np.isin(model.dof_bodyid, ancestors(model, held_body(model, grip)))
-        joints = model.jnt_type[model.dof_jntid[dofs]]
-        if is_free or np.any(joints == mujoco.mjtJoint.mjJNT_FREE):
-            held |= dofs
-    return np.flatnonzero(held)
+        tool = held_body(scene.model, grip)
+        chain = np.flatnonzero(np.isin(end.model.dof_bodyid, ancestors(scene.model, tool)))
+        if sizes[tool] > CHAOS and not np.any(end.qfrc_actuator[chain]):
+            found = np.union1d(found, chain)
+    return found
 
 
 def _hold(model: mujoco.MjModel, dofs: NDArray[np.intp], by: float = HELD) -> None:
@@ -453,14 +462,13 @@ def _moved(
     start: mujoco.MjData,
     count: int,
     disturbance: NDArray[np.float64] | None = None,
-    places: Callable[[mujoco.MjData], Places] | None = None,
-) -> Places | None:
-    """Returns places after so many of MuJoCo's steps; None if it diverges."""
+) -> mujoco.MjData | None:
+    """Returns the data after so many of MuJoCo's steps; None if it diverges."""
     data = copy.copy(start)
     if disturbance is not None:
         mujoco.mj_integratePos(model, data.qpos, disturbance, 1.0)
     mujoco.mj_step(model, data, count)
-    return None if any(warning.number for warning in data.warning) else (places or _places)(data)
+    return None if any(warning.number for warning in data.warning) else data
 
 
 def _places(data: mujoco.MjData, positions: NDArray[np.float64] | None = None) -> Places:
