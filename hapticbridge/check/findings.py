@@ -85,7 +85,8 @@ def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         yield Fault("time step matters", place, found.doubt, change)
     if found is not None and found.creation:
         kind = "energy in the slack" if case.is_rigid else "energy created"
-        yield Fault(kind, place, found.creation, "--contact rigid or --substeps")
+        change = found.calming(case.setting) or "slower joints"
+        yield Fault(kind, place, found.creation, change)
 
 
 def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:

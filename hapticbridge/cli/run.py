@@ -44,7 +44,7 @@ from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, c
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
 from hapticbridge.run.bridge import Bridge
-from hapticbridge.run.fidelity import NO_HAND, own_substeps
+from hapticbridge.run.fidelity import own_substeps
 from hapticbridge.run.hands import Grasp, GripAxis, check_grasps
 from hapticbridge.run.options import (
     AUTO,
@@ -380,7 +380,7 @@ class Run:
                 )
             if self.options.substeps is None:
                 with working("trying the scene"):
-                    chosen = chosen._with(substeps=chosen._own_substeps(source, scene))
+                    chosen = chosen._with(substeps=chosen._own_substeps(source, scene, device.info))
             return chosen._feel(scene, device, clock, stack, window, interrupts)
 
     @property
@@ -516,13 +516,14 @@ class Run:
             for grasp, is_pressed in zip(grasps, is_real, strict=True)
         ]
 
-    def _own_substeps(self, source: SceneSource, scene: Scene) -> int:
+    def _own_substeps(self, source: SceneSource, scene: Scene, info: DeviceInfo) -> int:
         """Returns the substeps that the scene needs; says if it moves otherwise than its file."""
         if self.options.method is not None:
             return 1
         ticks = self._scene_ticks(scene)
         period = max(ticks, 1) * period_of(self.options.loop_rate)
-        setting = RunPoint(NO_HAND, period, contact=self.options.contact or "rigid")
+        coupling = default_coupling(info, period, *self.options.workspace.scales)
+        setting = RunPoint(coupling, period, contact=self.options.contact or "rigid")
         count, moved = own_substeps(source, scene, setting)
         if ticks:  # more steps would not be in time
             count = 1
@@ -534,7 +535,7 @@ class Run:
         elif moved is not None and moved.deviations:
             notify("; ".join(filter(None, (str(moved), moved.advice(setting)))))
         if moved is not None and moved.creation:
-            notify(moved.creation)
+            notify("; ".join(filter(None, (moved.creation, moved.calming(setting)))))
         return count
 
     def _scene_ticks(self, scene: Scene) -> int:

@@ -30,6 +30,7 @@ from hapticbridge.scene import Scene, SceneSource, plain_model
 from hapticbridge.scene.checks import ancestors
 from hapticbridge.scene.compile import reset
 from hapticbridge.scene.handle import copy_values
+from hapticbridge.scene.rehearsal import holding_force
 from hapticbridge.units import format_si
 
 SECONDS = 1.0
@@ -55,6 +56,10 @@ its motion; no unit. Where it grows to 1 cm, chance decides whether a third is f
 
 DISTURBANCE = 1e-6
 """Disturbance in m or rad of the start in the file's other motion, far below what is seen."""
+
+MORE = 1.0
+"""Force in N of a still hand by which a remedy may exceed that without it. A remedy that lets the
+hand bear more is none: it would begin with a push."""
 
 NOTABLE_ENERGY = 1e-4
 """Energy in J that a scene may create without a hand and without a word: a tenth of what a hand
@@ -110,12 +115,14 @@ class Deviation(NamedTuple):
         apart: Distance in m between its two places at the end; inf if the scene diverges here.
         turned: Angle in rad between its two orientations at the end.
         moved: Distance in m that it moves under the file's own options.
+        number: Number of the body in the file's model.
     """
 
     body: str
     apart: float
     turned: float
     moved: float
+    number: int = 0
 
     @property
     def size(self) -> float:
@@ -136,6 +143,8 @@ class Fidelity:
         created: Energy in J that the scene created meanwhile in the bridge.
         causes: Replacements that move the first of the deviations furthest.
         remedy: Rate, substeps and contact with which no body deviates, tried; None without one.
+        force: Largest force in N with which a still hand holds the tool with the remedy.
+        calmer: Substeps and contact with which the scene creates no energy, tried; None without.
     """
 
     deviations: tuple[Deviation, ...]
@@ -146,6 +155,8 @@ class Fidelity:
     created: float
     causes: tuple[Cause, ...] = ()
     remedy: RunPoint | None = None
+    force: float = 0.0
+    calmer: RunPoint | None = None
 
     @property
     def size(self) -> float:
@@ -197,23 +208,34 @@ class Fidelity:
         return (
             f"without a hand, the scene creates {format_si(self.created, 'J')} within "
             f"{self.seconds:.2g} s, as fast joints do in MuJoCo's steps, and the audit may call it "
-            "active; --contact rigid takes it back, and more --substeps create less"
+            "active"
         )
 
     def advice(self, setting: RunPoint) -> str:
-        """Returns the options that were tried and mend a run with a setting; empty without."""
+        """Returns options of a run that mend a deviation, and what they gave; empty without."""
         if self.remedy is None:
             return ""
-        flags = [
-            flag
-            for flag, is_changed in (
-                (f"--rate {1.0 / self.remedy.period:g}", self.remedy.period != setting.period),
-                (f"--substeps {self.remedy.substeps}", self.remedy.substeps != setting.substeps),
-                (f"--contact {self.remedy.contact}", self.remedy.contact != setting.contact),
-            )
-            if is_changed
-        ]
-        return f"{' '.join(flags)} (tried: each body is then within {format_si(PLACE, 'm')})"
+        return (
+            f"{_flags(self.remedy, setting)} (tried: each body is then within "
+            f"{format_si(PLACE, 'm')}, and a still hand holds the tool with at most "
+            f"{format_si(self.force, 'N')})"
+        )
+
+    def calming(self, setting: RunPoint) -> str:
+        """Returns options of a run with which the scene creates no energy; empty without."""
+        if self.calmer is None:
+            return ""
+        return f"{_flags(self.calmer, setting)} (tried: it then creates none)"
+
+
+def _flags(changed: RunPoint, setting: RunPoint) -> str:
+    """Returns the options of ``hapticbridge run`` that change a setting into another one."""
+    flags = {
+        f"--rate {1.0 / changed.period:g}": changed.period != setting.period,
+        f"--substeps {changed.substeps}": changed.substeps != setting.substeps,
+        f"--contact {changed.contact}": changed.contact != setting.contact,
+    }
+    return " ".join(flag for flag, is_changed in flags.items() if is_changed)
 
 
 def fidelity(
@@ -236,7 +258,7 @@ def fidelity(
     Args:
         source: The scene; it is not changed.
         scene: Result of ``compile_scene`` from it; prepared here, and not at its start afterwards.
-        setting: Rate, substeps and contact; the coupling is not used.
+        setting: Rate, substeps and contact of both, and the coupling of a hand that tries a remedy.
         max_work: Largest work of one motion (``MAX_WORK``), which shortens it.
 
     Returns:
@@ -301,26 +323,37 @@ class _FileMotion:
         return self.count * self.step
 
     def against(self, scene: Scene, setting: RunPoint) -> Fidelity:
-        """Compares with the motion in the bridge, and looks for the cause of what deviates."""
+        """Compares with the motion in the bridge, and looks for causes and remedies."""
         here, found = self._compared(scene, setting)
+        if found.creation:
+            calm = (each for each in self._calmer(setting) if not self._tried(scene, each).creation)
+            found = replace(found, calmer=next(calm, None))
         if not found.deviations:
             return found
-        found = replace(found, causes=tuple(self._causes(scene, setting, here)))
+        worst = found.deviations[0].number
+        found = replace(found, causes=tuple(self._causes(scene, setting, here, worst)))
+        most = _force(scene, setting) + MORE
         for other in self._settings(setting):
-            try:
-                _, trial = self._compared(scene, other)
-            except SceneError:  # its own contacts refuse a tool that starts inside something
+            trial = self._tried(scene, other)
+            if trial.deviations or trial.created > max(found.created, NOTABLE_ENERGY):
                 continue
-            if not trial.deviations and trial.created <= max(found.created, NOTABLE_ENERGY):
-                return replace(found, remedy=other)
+            if (force := _force(scene, other)) <= most:
+                return replace(found, remedy=other, force=force)
         return found
+
+    def _tried(self, scene: Scene, setting: RunPoint) -> Fidelity:
+        """Compares a remedy; one that the scene refuses counts as one with which it diverges."""
+        try:
+            return self._compared(scene, setting)[1]
+        except SceneError:  # its own contacts refuse a tool that starts inside something
+            return replace(self._diverged, created=math.inf)
 
     def _compared(self, scene: Scene, setting: RunPoint) -> tuple[Places | None, Fidelity]:
         """Returns places in the bridge, None if it diverges, and what deviates."""
         created = self._moved_here(scene, replace(setting, coupling=NO_HAND))
-        found = Fidelity((), (), self._count_free(), self.step, self.seconds, created)
         if math.isinf(created):
-            return None, replace(found, deviations=(Deviation("", math.inf, 0.0, math.inf),))
+            return None, self._diverged
+        found = Fidelity((), (), self._count_free(), self.step, self.seconds, created)
         here = self._places(scene.data)
         apart = here.apart(self.end)
         sizes = _size(apart)
@@ -333,12 +366,17 @@ class _FileMotion:
         return here, replace(
             found,
             deviations=tuple(
-                Deviation(names[i], float(apart[0, i]), float(apart[1, i]), float(moved[i]))
+                Deviation(names[i], float(apart[0, i]), float(apart[1, i]), float(moved[i]), i)
                 for i in worst
                 if sizes[i] > allowed[i]
             ),
             incomparable=tuple(names[i] for i in worst if sizes[i] <= allowed[i]),
         )
+
+    @property
+    def _diverged(self) -> Fidelity:
+        lost = (Deviation("", math.inf, 0.0, math.inf),)
+        return Fidelity(lost, (), self._count_free(), self.step, self.seconds, math.inf)
 
     def _count_free(self) -> int:
         """Returns the number of bodies that can move while the tool is held."""
@@ -369,8 +407,16 @@ class _FileMotion:
             if own != setting:
                 yield replace(own, contact="scene")
 
-    def _causes(self, scene: Scene, setting: RunPoint, here: Places | None) -> Iterator[Cause]:
-        """Yields the replacements that move the worst body furthest, or at least half as far.
+    def _calmer(self, setting: RunPoint) -> Iterator[RunPoint]:
+        """Yields settings of a run in which fast joints may create less energy."""
+        if setting.contact != RIGID:
+            yield replace(setting, contact="rigid")
+        yield replace(setting, substeps=min(2 * setting.substeps, MAX_SUBSTEPS))
+
+    def _causes(
+        self, scene: Scene, setting: RunPoint, here: Places | None, body: int
+    ) -> Iterator[Cause]:
+        """Yields the replacements that move a body furthest, or at least half as far.
 
         The file's motion gets one replacement after the other, until it is that of the bridge;
         ``here`` is None where that diverges.
@@ -383,8 +429,7 @@ class _FileMotion:
         if len(known) < len(motions):
             yield list(Cause)[motions.index(None) - 1]
             return
-        worst = int(np.argmax(_size(known[-1].apart(self.end))))
-        sizes = [float(_size(after.apart(before))[worst]) for before, after in pairwise(known)]
+        sizes = [float(_size(after.apart(before))[body]) for before, after in pairwise(known)]
         for cause, size in zip(Cause, sizes, strict=True):
             if size >= 0.5 * max(sizes):
                 yield cause
@@ -417,8 +462,9 @@ class _FileMotion:
         Returns:
             The energy in J that it created; inf if it diverges.
         """
-        parameters = rehearsal_parameters(scene, setting)
-        _hold(scene.model, self.held)
+        parameters, model = rehearsal_parameters(scene, setting), scene.model
+        inertia = model.dof_armature.copy(), model.dof_M0.copy()
+        _hold(model, self.held)
         binding = BoundKernel(scene.model, scene.data, parameters)
         state, row, step = binding.state, binding.row, binding.step
         still, period = np.zeros(1, SAMPLE_DTYPE), setting.period
@@ -436,7 +482,15 @@ class _FileMotion:
             return float(state[0]["energy"]["environment_energy"])
         finally:
             binding.release()
-            _hold(scene.model, self.held, by=-HELD)
+            model.dof_armature[:], model.dof_M0[:] = inertia  # to the last bit, as a run follows
+
+
+def _force(scene: Scene, setting: RunPoint) -> float:
+    """Returns the largest force in N with which a still hand holds the tool; inf if it cannot."""
+    try:
+        return holding_force(scene, rehearsal_parameters(scene, setting))
+    except SceneError:
+        return math.inf
 
 
 def _loose_dofs(scene: Scene, start: Places, end: mujoco.MjData) -> NDArray[np.intp]:
@@ -451,10 +505,10 @@ def _loose_dofs(scene: Scene, start: Places, end: mujoco.MjData) -> NDArray[np.i
     return found
 
 
-def _hold(model: mujoco.MjModel, dofs: NDArray[np.intp], by: float = HELD) -> None:
+def _hold(model: mujoco.MjModel, dofs: NDArray[np.intp]) -> None:
     """Adds inertia to degrees of freedom; MuJoCo reads ``dof_M0`` for bodies alone in a tree."""
-    model.dof_armature[dofs] += by
-    model.dof_M0[dofs] += by
+    model.dof_armature[dofs] += HELD
+    model.dof_M0[dofs] += HELD
 
 
 def _moved(
