@@ -31,6 +31,7 @@ from hapticbridge.scene.checks import ancestors
 from hapticbridge.scene.compile import reset
 from hapticbridge.scene.handle import copy_values
 from hapticbridge.scene.rehearsal import holding_force
+from hapticbridge.scene.start import constraint_name
 from hapticbridge.units import format_si
 
 SECONDS = 1.0
@@ -142,6 +143,8 @@ class Fidelity:
         seconds: Time in s that was compared.
         created: Energy in J that the scene created meanwhile in the bridge.
         causes: Replacements that move the first of the deviations furthest.
+        constraint: Name of the constraint of the file whose force does most of the work between
+            both places of its body; empty if none does.
         remedy: Rate, substeps and contact with which no body deviates, tried; None without one.
         force: Largest force in N with which a still hand holds the tool with the remedy.
         calmer: Substeps and contact with which the scene creates no energy, tried; None without.
@@ -154,6 +157,7 @@ class Fidelity:
     seconds: float
     created: float
     causes: tuple[Cause, ...] = ()
+    constraint: str = ""
     remedy: RunPoint | None = None
     force: float = 0.0
     calmer: RunPoint | None = None
@@ -176,6 +180,8 @@ class Fidelity:
             )
         more = f", and {len(others)} more bodies deviate" if others else ""
         cause = " and ".join(each.value for each in self.causes)
+        if self.constraint and Cause.CONTACT in self.causes:
+            cause += f", here of {self.constraint}"
         return (
             f"without a hand, '{first.body}' is after {self.seconds:.2g} s "
             f"{format_si(first.apart, 'm')} and {np.rad2deg(first.turned):.2g} deg from where the "
@@ -248,7 +254,8 @@ def fidelity(
     with a body's centre of mass p under the file's own integrator, time step, solver and contacts,
     and q in the bridge. Both start as the run does, on the file's constraints, with its controls
     and without the mocap bodies that the hand replaces (``Scene.differences`` names both). A tool
-    that the file lets move by ``CHAOS`` without a motor is held in both, as by a hand at rest.
+    that the file lets move by ``CHAOS`` is held in both at the joints without a motor's force, as
+    by a hand at rest.
 
     A body deviates if its size is above 1 and above ``SPREAD`` times that between the file's motion
     and a second one of it, with half the time step and a start disturbed by ``DISTURBANCE``, and if
@@ -280,10 +287,11 @@ def fidelity(
 class _FileMotion:
     """Motion of a scene's bodies under the file's own options, from the run's start.
 
-    ``data`` is at the start.
+    ``data`` is at the start, ``last`` at the end.
     """
 
     data: mujoco.MjData
+    last: mujoco.MjData
     start: Places
     end: Places
     count: int
@@ -308,7 +316,7 @@ class _FileMotion:
             _hold(model, held)
             mujoco.mj_forward(model, data)
             end = _moved(model, data, count)
-        return None if end is None else cls(data, start, _places(end), count, held)
+        return None if end is None else cls(data, end, start, _places(copy.copy(end)), count, held)
 
     @property
     def model(self) -> mujoco.MjModel:
@@ -325,13 +333,16 @@ class _FileMotion:
     def against(self, scene: Scene, setting: RunPoint) -> Fidelity:
         """Compares with the motion in the bridge, and looks for causes and remedies."""
         here, found = self._compared(scene, setting)
+        way = np.zeros(self.model.nv)
+        mujoco.mj_differentiatePos(self.model, way, 1.0, scene.data.qpos, self.last.qpos)
         if found.creation:
             calm = (each for each in self._calmer(setting) if not self._tried(scene, each).creation)
             found = replace(found, calmer=next(calm, None))
         if not found.deviations:
             return found
         worst = found.deviations[0].number
-        found = replace(found, causes=tuple(self._causes(scene, setting, here, worst)))
+        causes = tuple(self._causes(scene, setting, here, worst))
+        found = replace(found, causes=causes, constraint=_working(self.last, worst, way))
         most = _force(scene, setting) + MORE
         for other in self._settings(setting):
             trial = self._tried(scene, other)
@@ -493,6 +504,24 @@ def _force(scene: Scene, setting: RunPoint) -> float:
         return math.inf
 
 
+def _working(data: mujoco.MjData, body: int, way: NDArray[np.float64]) -> str:
+    """Returns the name of the constraint whose force does the most work on a body's joints.
+
+    ``way`` (nv,) is that of the joints from one place to another; empty if there is no work.
+    """
+    model = data.model
+    rows = np.zeros((data.nefc, model.nv))
+    if mujoco.mj_isSparse(model) and data.nefc:
+        mujoco.mju_sparse2dense(
+            rows, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
+        )
+    elif data.nefc:
+        rows = data.efc_J.reshape(data.nefc, model.nv)
+    chain = np.isin(model.dof_bodyid, ancestors(model, body))
+    work = np.abs(data.efc_force * (rows[:, chain] @ way[chain]))
+    return constraint_name(model, data, int(np.argmax(work))) if work.any() else ""
+
+
 def _loose_dofs(scene: Scene, start: Places, end: mujoco.MjData) -> NDArray[np.intp]:
     """Returns the degrees of freedom that carry tools which fall or swing without a hand."""
     found = np.zeros(0, np.intp)
@@ -500,9 +529,9 @@ def _loose_dofs(scene: Scene, start: Places, end: mujoco.MjData) -> NDArray[np.i
     for grip in (scene.grip, *scene.other_grips):
         tool = held_body(scene.model, grip)
         chain = np.flatnonzero(np.isin(end.model.dof_bodyid, ancestors(scene.model, tool)))
-        if sizes[tool] > CHAOS and not np.any(end.qfrc_actuator[chain]):
-            found = np.union1d(found, chain)
-    return found
+        if sizes[tool] > CHAOS:
+            found = np.union1d(found, chain[end.qfrc_actuator[chain] == 0.0])
+    return found.astype(np.intp)
 
 
 def _hold(model: mujoco.MjModel, dofs: NDArray[np.intp]) -> None:

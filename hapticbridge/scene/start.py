@@ -88,11 +88,11 @@ def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Sta
         last = _violations(trial, data)
     still = {row: size for row, size in last.items() if size > VIOLATION}
     remaining = [
-        f"{_row_name(model, row)} starts {_off(model, row, still[row])}, and stays so"
+        f"{row_name(model, row)} starts {_off(model, row, still[row])}, and stays so"
         for row in still
     ]
     words = [
-        f"start of {_row_name(model, row)}: {_off(model, row, size)} → closed"
+        f"start of {row_name(model, row)}: {_off(model, row, size)} → closed"
         for row, size in first.items()
         if size > VIOLATION and row not in still and row[0] != "joint"
     ]
@@ -154,6 +154,27 @@ def _without_forces(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjDat
     return trial, data
 
 
+def constraint_name(model: mujoco.MjModel, data: mujoco.MjData, row: int) -> str:
+    """Returns the name of the constraint that a row of the data belongs to."""
+    kind, number = int(data.efc_type[row]), int(data.efc_id[row])
+    if kind in _ROWS:
+        limit = "" if _ROWS[kind] == "equality" else "the limit of "
+        return limit + row_name(model, (_ROWS[kind], number))
+    if kind == int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF):
+        joint = int(model.dof_jntid[number])
+        return f"the friction of joint '{model.joint(joint).name or joint}'"
+    if kind == int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON):
+        return f"the friction of tendon '{model.tendon(number).name or number}'"
+    sides = [int(geom) for geom in data.contact[number].geom if geom >= 0]
+    names = [
+        f"geom '{model.geom(i).name}'"
+        if model.geom(i).name
+        else f"body '{model.body(int(model.geom_bodyid[i])).name}'"
+        for i in sides
+    ]
+    return f"the contact of {' and '.join(names) or 'a flex'}"
+
+
 def _violations(model: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, int], float]:
     """Returns the largest violation in m or rad of each limit and equality constraint."""
     found: dict[tuple[str, int], float] = {}
@@ -167,7 +188,8 @@ def _violations(model: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, i
     return found
 
 
-def _row_name(model: mujoco.MjModel, row: tuple[str, int]) -> str:
+def row_name(model: mujoco.MjModel, row: tuple[str, int]) -> str:
+    """Returns the name of a constraint, given as its kind in ``_ROWS`` and its number."""
     kind, number = row
     if kind != "equality":
         return f"{kind} '{getattr(model, kind)(number).name or number}'"
