@@ -46,7 +46,7 @@ from hapticbridge.scene.physics import depth_under
 
 CREATED = {"energy created", "energy in the slack"}
 
-CONSEQUENCES = CREATED | {"MuJoCo warning", "solver iterations"}
+CONSEQUENCES = CREATED | {"MuJoCo warning", "solver iterations", "own motion"}
 """Faults in the motion to which a planted one may lead."""
 
 CURED = {

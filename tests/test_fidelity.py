@@ -90,6 +90,33 @@ def test_contacts_are_named_where_they_are_the_cause_and_undone_where_that_mends
     assert "rigid contacts in place of the file's own" in str(found)
 
 
+MARGIN = """<mujoco><option timestep="0.001" gravity="0 0 0"/><worldbody>
+<body name="finger"><joint name="knuckle" axis="0 1 0" range="0 90" margin="0.02" damping=".01"/>
+<geom type="capsule" fromto="0 0 0 .05 0 0" size=".005" mass=".5"/></body>
+<body pos="0 1 0"><joint axis="0 0 1"/><geom size=".01"/><site name="grip" pos=".1 0 0"/></body>
+</worldbody><actuator><position joint="knuckle" kp=".01" ctrllimited="false"/></actuator>
+<keyframe><key name="home" ctrl="-0.5"/></keyframe></mujoco>"""
+"""A servo that presses a finger onto its limit, which begins 0.02 rad before the range ends."""
+
+
+def test_a_limit_with_a_margin_holds_where_its_file_lets_it(tmp_path: Path) -> None:
+    source = scene(tmp_path, MARGIN)
+    bridged = compile_scene(source)
+    assert [change.words for change in bridged.differences[1:]] == [
+        "start of joint 'knuckle': 0 deg → 1.15 deg, its limit"
+    ]
+    found = fidelity(source, bridged, RunPoint(NO_HAND, PERIOD))
+    assert found is not None
+    assert (found.bodies, found.deviations, found.incomparable) == (2, (), ())
+    assert bridged.data.qpos[0] == pytest.approx(0.02, abs=5e-5)
+    assert found.created <= ENERGY_TOLERANCE
+    # without the margin in the scene it would rest at the end of the range
+    bare = scene(tmp_path, MARGIN.replace('margin="0.02"', ""))
+    bridged = compile_scene(bare)
+    fidelity(bare, bridged, RunPoint(NO_HAND, PERIOD))
+    assert bridged.data.qpos[0] == pytest.approx(0.0, abs=5e-5)
+
+
 def test_a_remedy_that_lets_the_hand_bear_more_is_none(tmp_path: Path) -> None:
     tool = '<body pos="1 0 1"><joint/><geom size=".01" pos="0 0 -.1"/><site name="grip"/></body>'
     on_ground = """<body pos="1 0 .02"><joint type="slide" axis="0 0 1"/><site name="grip"/>
@@ -167,6 +194,12 @@ def test_a_short_step_is_kept_where_the_scene_needs_it(tmp_path: Path) -> None:
     assert found.deviations == ()
     does_not = scene(tmp_path, ARM.replace("0.002", "0.0002"))
     assert own_substeps(does_not, compile_scene(does_not), RunPoint(NO_HAND, PERIOD))[0] == 1
+
+
+def test_a_scene_that_diverges_in_the_bridge_alone_fails(tmp_path: Path) -> None:
+    (fault,) = own_motion_faults(open_case(scene(tmp_path, FILTER)))
+    assert (fault.kind, fault.is_note) == ("divergence", False)
+    assert "--substeps 10 (tried: " in fault.change
 
 
 def test_a_scene_that_diverges_by_itself_has_nothing_to_respect(tmp_path: Path) -> None:

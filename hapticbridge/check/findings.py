@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -71,7 +72,7 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
 
 
 def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Yields a fault if the scene alone moves noticeably differently than its file says."""
+    """Yields findings on a scene that moves by itself otherwise than its file says."""
     if case.refused or first_pump(case.model) is not None:
         return  # the file's own scene does not compile, or a pump moves it without bound
     scene = compile_scene(case.source, case.scene.grip, warns=False, checks_start=False)
@@ -79,7 +80,8 @@ def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     place = case.places.option("timestep")
     if found is not None and found.deviations:
         change = found.advice(case.setting) or "nothing that was tried mends it"
-        yield Fault("own motion", place, str(found), change)
+        kind = "divergence" if math.isinf(found.size) else "own motion"
+        yield Fault(kind, place, str(found), change)
     if found is not None and found.doubt:
         change = "a shorter time step, with which the places no longer change"
         yield Fault("time step matters", place, found.doubt, change)

@@ -40,7 +40,7 @@ SECONDS = 1.0
 MAX_WORK = 1e5
 """Largest work of one motion at the start of a run, in degrees of freedom and constraint rows,
 summed over its steps: 0.3 to 0.7 s. Heavier scenes are compared over less than ``SECONDS`` there,
-and in full by a check."""
+without a trial of remedies, and in full by a check."""
 
 PLACE, TURN = 1e-3, 0.01
 """Largest distance in m and angle in rad between two places of a body that count as one: what
@@ -343,6 +343,8 @@ class _FileMotion:
         worst = found.deviations[0].number
         causes = tuple(self._causes(scene, setting, here, worst))
         found = replace(found, causes=causes, constraint=_working(self.last, worst, way))
+        if self.seconds < SECONDS - self.step:
+            return found  # too heavy for trials at the start of a run
         most = _force(scene, setting) + MORE
         for other in self._settings(setting):
             trial = self._tried(scene, other)
@@ -364,10 +366,10 @@ class _FileMotion:
         created = self._moved_here(scene, replace(setting, coupling=NO_HAND))
         if math.isinf(created):
             return None, self._diverged
-        found = Fidelity((), (), self._count_free(), self.step, self.seconds, created)
+        found = Fidelity((), (), int(self._are_free().sum()), self.step, self.seconds, created)
         here = self._places(scene.data)
         apart = here.apart(self.end)
-        sizes = _size(apart)
+        sizes = np.where(self._are_free(), _size(apart), 0.0)
         if sizes.max(initial=0.0) <= 1.0:
             return here, found
         moved, spread = self.start.apart(self.end)[0], self._spread()
@@ -387,15 +389,15 @@ class _FileMotion:
     @property
     def _diverged(self) -> Fidelity:
         lost = (Deviation("", math.inf, 0.0, math.inf),)
-        return Fidelity(lost, (), self._count_free(), self.step, self.seconds, math.inf)
+        return Fidelity(lost, (), int(self._are_free().sum()), self.step, self.seconds, math.inf)
 
-    def _count_free(self) -> int:
-        """Returns the number of bodies that can move while the tool is held."""
+    def _are_free(self) -> NDArray[np.bool_]:
+        """Returns True for each body that can move while the tool is held."""
         model, free = self.model, np.zeros(self.model.nbody, bool)
         free[np.delete(model.dof_bodyid, self.held)] = True
         for body in range(1, model.nbody):  # parents come first
             free[body] |= free[model.body_parentid[body]]
-        return int(np.count_nonzero(free))
+        return free
 
     def _spread(self) -> NDArray[np.float64]:
         """Returns the size of the difference to a second motion of the file, (nbody,)."""

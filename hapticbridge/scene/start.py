@@ -124,12 +124,13 @@ def _projected(trial: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64
 
 
 def _clamp_joints(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Moves hinges and slides into their limits, without any other joint."""
+    """Moves hinges and slides to their limits' margins, where MuJoCo's limits rest, alone."""
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_LIMIT:
         return
     single = (model.jnt_limited != 0) & (model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))
     places, (low, high) = model.jnt_qposadr[single], model.jnt_range[single].T
-    data.qpos[places] = np.clip(data.qpos[places], low, high)
+    margin = np.minimum(model.jnt_margin[single], 0.5 * (high - low))
+    data.qpos[places] = np.clip(data.qpos[places], low + margin, high - margin)
 
 
 def _without_forces(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -146,7 +147,6 @@ def _without_forces(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjDat
     for name in ("eq_sol{}", "jnt_sol{}", "tendon_sol{}_lim"):
         getattr(trial, name.format("ref"))[:] = -1.0, 0.0
         getattr(trial, name.format("imp"))[:] = STIFF, STIFF, 1.0, 0.5, 2.0
-    trial.jnt_margin[:] = trial.tendon_margin[:] = 0.0
     data = mujoco.MjData(trial)
     reset(trial, data)
     data.qvel[:] = 0.0
@@ -178,7 +178,8 @@ def constraint_name(model: mujoco.MjModel, data: mujoco.MjData, row: int) -> str
 def _violations(model: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, int], float]:
     """Returns the largest violation in m or rad of each limit and equality constraint."""
     found: dict[tuple[str, int], float] = {}
-    for kind, number, distance in zip(data.efc_type, data.efc_id, data.efc_pos, strict=True):
+    distances = data.efc_pos - data.efc_margin
+    for kind, number, distance in zip(data.efc_type, data.efc_id, distances, strict=True):
         row = _ROWS.get(int(kind), ""), int(number)
         is_equality = row[0] == "equality"
         if not row[0] or (is_equality and int(model.eq_type[number]) not in _KINDS):
