@@ -12,6 +12,7 @@ from outside_scenes import CONTACT, hand_file, mjcf, scene_file
 
 from hapticbridge.recording import read_recording
 from hapticbridge.scene import scene_path
+from hapticbridge.scene.fault import FAILS
 
 PLANT = {plant.kind: plant for plant in PLANTS}
 
@@ -54,19 +55,31 @@ def test_check_names_line_and_change_of_a_fault(tmp_path: Path, call: Called) ->
     code, out, _ = call("check", scene, "--contact", "scene")
     file, line = line_of(plant, scene)
     assert f" margin  {file}:{line}, geom 'button'" in out
-    assert 'write: margin="0"' in out
-    assert code == 1
+    assert 'to change it: margin="0"' in out
+    assert code == 0
     assert "motion: the default hand motion: slow, 1 cm along and 0.1 rad about each axis" in out
 
 
 def test_the_json_holds_counts_faults_and_cost(tmp_path: Path, call: Called) -> None:
     scene = bench(tmp_path / "scene", PLANT["keyframe"])
     code, facts = facts_of(call, "check", scene, "--rate", 2000, "--stiffness", 1000)
-    assert (code, facts["period_s"], facts["coupling"]["stiffness"]) == (1, 0.0005, 1000)
+    assert (code, facts["period_s"], facts["coupling"]["stiffness"]) == (0, 0.0005, 1000)
     assert facts["inventory"]["degrees_of_freedom"] == 14
     assert {"free", "contact", "stages", "highest_rate", "by_rows"} <= facts["cost"].keys()
     [fault] = facts["faults"]
     assert (fault["kind"], fault["place"]["file"]) == ("keyframe", "bench.xml")
+    assert fault["is_note"]
+
+
+def test_code_1_is_for_what_fails_and_not_for_advice(tmp_path: Path, call: Called) -> None:
+    advice = [plant for plant in PLANTS if not FAILS[plant.kind]]
+    code, out, _ = call("check", bench(tmp_path / "advice", *advice))
+    assert (code, "What is wrong\n  nothing found" in out) == (0, True)
+    for kind in ("density of water", "heavy tool", "visual geom with mass", "far grip"):
+        assert f" {kind}  " in out.partition("Worth knowing")[2]
+    scene = bench(tmp_path / "fault", PLANT["margin"], PLANT["not passive"])
+    code, out, _ = call("check", scene, "--contact", "scene")
+    assert (code, "What is wrong: 1 found" in out) == (1, True)
 
 
 def test_a_recording_is_a_motion_too(tmp_path: Path, call: Called) -> None:
@@ -96,7 +109,7 @@ def test_check_leaves_no_log_of_mujocos_warnings(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     scene = bench(tmp_path / "scene", PLANT["mass ratio"], PLANT["solver iterations"])
-    assert call("check", scene)[0] == 1
+    assert " mass ratio  " in call("check", scene)[1]
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
 
 

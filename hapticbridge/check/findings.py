@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -17,7 +18,7 @@ from hapticbridge.check.geometry_faults import grip_faults, mesh_faults, workspa
 from hapticbridge.check.mass_faults import mass_faults
 from hapticbridge.check.run_faults import run_faults
 from hapticbridge.errors import choices
-from hapticbridge.run.own_motion import own_motion
+from hapticbridge.run.fidelity import fidelity
 from hapticbridge.scene import compile_scene
 from hapticbridge.scene.checks import check_model, first_pump
 from hapticbridge.scene.compile import START_KEYFRAME
@@ -51,7 +52,6 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             f"one step per tick at {1 / case.period:g} Hz, and its contacts change with it",
             f"{places.option_change('timestep', f'{case.period:g}')}, or check with --rate "
             f"{1 / step:g}",
-            is_note=True,
         )
     for change in case.scene.differences:
         if not change.kind:  # those of a kind have a fault of their own
@@ -60,7 +60,6 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
                 places.option("integrator"),
                 f"the scene runs with a change, {change}",
                 "run --as-is, which refuses the scene",
-                is_note=True,
             )
     found = (
         ("wind", case.source.concerns),
@@ -73,16 +72,23 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
 
 
 def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Yields a fault if the scene alone moves noticeably differently than its file says."""
+    """Yields findings on a scene that moves by itself otherwise than its file says."""
     if case.refused or first_pump(case.model) is not None:
         return  # the file's own scene does not compile, or a pump moves it without bound
     scene = compile_scene(case.source, case.scene.grip, warns=False, checks_start=False)
-    found = own_motion(case.source, scene, case.setting)
+    found = fidelity(case.source, scene, case.setting)
     place = case.places.option("timestep")
-    if found is not None and found.jnd > 1.0:
-        yield Fault("own motion", place, str(found), found.remedy(case.setting))
+    if found is not None and found.deviations:
+        change = found.advice(case.setting) or "nothing that was tried mends it"
+        kind = "divergence" if math.isinf(found.size) else "own motion"
+        yield Fault(kind, place, str(found), change)
+    if found is not None and found.doubt:
+        change = "a shorter time step, with which the places no longer change"
+        yield Fault("time step matters", place, found.doubt, change)
     if found is not None and found.creation:
-        yield Fault("own motion", place, found.creation, "--contact rigid or --substeps")
+        kind = "energy in the slack" if case.is_rigid else "energy created"
+        change = found.calming(case.setting) or "slower joints"
+        yield Fault(kind, place, found.creation, change)
 
 
 def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:

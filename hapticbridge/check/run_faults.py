@@ -89,19 +89,24 @@ def _falling_bodies(case: SceneUnderCheck, seen: Observation) -> Iterator[Fault]
 
 def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:
     """Names the contact with the largest force; the meter cannot tell which created energy."""
-    used = f"{number(100 * seen.slack_share)} % of the coupling's slack, which covers it"
-    if seen.environment == "active":
-        used = "more than the coupling's slack covers"
+    kind, used = (
+        ("energy created", "more than the coupling's slack covers")
+        if seen.environment == "active"
+        else (
+            "energy in the slack",
+            f"{number(100 * seen.slack_share)} % of the coupling's slack, which covers it",
+        )
+    )
     sentence = (
         f"contacts or joints created energy in the motion: {used}; a hand that yields, as in a "
         "run, may see less"
     )
     if not seen.meetings or case.is_rigid:
-        return _created_without_contact(case, sentence)
+        return _created_without_contact(case, kind, sentence)
     pair = max(seen.meetings, key=lambda each: seen.meetings[each].force)
     one, other = (case.places.geom(geom) for geom in pair)
     return Fault(
-        "energy created",
+        kind,
         one,
         f"{sentence}; the largest force was between {one.element} and {other.element}",
         f"{suggested_solref(case.step)} there and at {other.file}:"
@@ -109,7 +114,7 @@ def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:
     )
 
 
-def _created_without_contact(case: SceneUnderCheck, sentence: str) -> Fault:
+def _created_without_contact(case: SceneUnderCheck, kind: str, sentence: str) -> Fault:
     """Names the tool's joints: their axes turn within a step, the only other source of energy."""
     model = case.model
     tool_joints = np.flatnonzero(case.tool_bodies[model.jnt_bodyid])
@@ -118,4 +123,4 @@ def _created_without_contact(case: SceneUnderCheck, sentence: str) -> Fault:
     else:
         change = f'damping="{LITTLE_DAMPING:g}" or more there, or slower springs and actuators'
         place = case.places.joint(int(tool_joints[0]))
-    return Fault("energy created", place, sentence, change)
+    return Fault(kind, place, sentence, change)

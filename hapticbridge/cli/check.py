@@ -36,7 +36,7 @@ from hapticbridge.check.lean import (
 from hapticbridge.check.lean_output import check_target, lean_facts, write_lean
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.check.version import SceneVariant
-from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress
+from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress, working
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import default_coupling
@@ -290,8 +290,8 @@ class Check:
     """Find what is wrong with a scene, and what a tick of it costs.
 
     Leads the scene through its hand's motion and names every fault with the line to change. Exit
-    code 0 if nothing is wrong, 1 if something is, 2 if the scene cannot be read. Notes, such as
-    changes that a run makes by itself, do not affect the exit code.
+    code 1 if a run would fail, 2 if the scene cannot be read, else 0. Notes, such as a mass that
+    MuJoCo chose or a change that a run makes by itself, do not affect the exit code.
 
     Example:
         hapticbridge check my_tool.xml --lean --write lean.xml
@@ -374,7 +374,8 @@ class Check:
                 progress=show,
             )
         inventory = take_inventory(case.model, self.grip, case.places, case.observation)
-        faults, cost = find_faults(case), None
+        with working("looking for what is wrong"):
+            faults, cost = find_faults(case), None
         if case.observation is not None:
             with progress("timing it") as show, quiet():
                 cost = measure_cost(case.scene, case.samples, case.setting, progress=show)
@@ -449,6 +450,6 @@ def _facts(
         "period_s": case.period,
         "contact": case.contact,
         "inventory": asdict(inventory),
-        "faults": [asdict(fault) for fault in faults],
+        "faults": [asdict(fault) | {"is_note": fault.is_note} for fault in faults],
         "cost": None if cost is None else asdict(cost),
     }

@@ -17,7 +17,15 @@ import numpy as np
 from rich.markup import escape
 
 from hapticbridge.arguments import option, shared
-from hapticbridge.cli.terminal import compiling, err, notify, out, plain, print_json
+from hapticbridge.cli.terminal import (
+    compiling,
+    err,
+    notify,
+    out,
+    plain,
+    print_json,
+    working,
+)
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import (
@@ -38,6 +46,7 @@ from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, c
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
 from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.fidelity import own_substeps
 from hapticbridge.run.hands import Grasp, GripAxis, check_grasps
 from hapticbridge.run.options import (
     AUTO,
@@ -48,7 +57,6 @@ from hapticbridge.run.options import (
     steady_rotational_stiffness,
     steady_stiffness,
 )
-from hapticbridge.run.own_motion import NO_HAND, own_substeps
 from hapticbridge.run.programs import prepare_run, words
 from hapticbridge.run.summary import WELD, Summary, coarse_spring, is_always_implicit
 from hapticbridge.scene import (
@@ -344,7 +352,7 @@ class Run:
         window = self._window() if self._is_viewed else None
         with ExitStack() as stack:
             interrupts = stack.enter_context(interrupting_on_signals())
-            with err.status("reading the scene …"):
+            with working("reading the scene"):
                 source = read_scene(self.scene, **settings_from(self.settings))
             held = self._completed(self._held(source.spec), own_grips(source))
             prepare_run(lambda left: notify(words(left)))
@@ -352,7 +360,7 @@ class Run:
                 return self._run_hands(source, held, clock, stack, window, interrupts)
             if held:
                 return self._alone(*held[0]).execute()
-            with err.status("trying the scene …"):
+            with working("trying the scene"):
                 with compiling(self.scene):
                     scene = compile_scene(source, self.grip, as_is=self.as_is)
                 self._warn_of_faults(source, scene)
@@ -374,8 +382,8 @@ class Run:
                     scene, [grasp], clock, stack, window, interrupts
                 )
             if self.options.substeps is None:
-                with err.status("trying the scene …"):
-                    chosen = chosen._with(substeps=chosen._own_substeps(source, scene))
+                with working("trying the scene"):
+                    chosen = chosen._with(substeps=chosen._own_substeps(source, scene, device.info))
             return chosen._feel(scene, device, clock, stack, window, interrupts)
 
     @property
@@ -487,7 +495,7 @@ class Run:
         if not axes:
             self._refuse_grip_scale()
         grips = check_grasps([Grasp(grip, grip_axis=axes.get(grip)) for grip, *_ in held])
-        with err.status("trying the scene …"), compiling(self.scene):
+        with working("trying the scene"), compiling(self.scene):
             scene = compile_scene(source, grips, as_is=self.as_is)
             self._warn_of_faults(source, scene)
         grasps, infos = [], []
@@ -514,13 +522,14 @@ class Run:
             for grasp, is_pressed in zip(grasps, is_real, strict=True)
         ]
 
-    def _own_substeps(self, source: SceneSource, scene: Scene) -> int:
+    def _own_substeps(self, source: SceneSource, scene: Scene, info: DeviceInfo) -> int:
         """Returns the substeps that the scene needs; says if it moves otherwise than its file."""
         if self.options.method is not None:
             return 1
         ticks = self._scene_ticks(scene)
         period = max(ticks, 1) * period_of(self.options.loop_rate)
-        setting = RunPoint(NO_HAND, period, contact=self.options.contact or "rigid")
+        coupling = default_coupling(info, period, *self.options.workspace.scales)
+        setting = RunPoint(coupling, period, contact=self.options.contact or "rigid")
         count, moved = own_substeps(source, scene, setting)
         if ticks:  # more steps would not be in time
             count = 1
@@ -529,10 +538,10 @@ class Run:
                 f"{count} MuJoCo steps per tick keep the file's own time step, without which the "
                 "scene alone would move noticeably differently (--substeps 1 takes one)"
             )
-        elif moved is not None and moved.jnd > 1.0:
-            notify(f"{moved}; {moved.remedy(setting)}")
+        elif moved is not None and moved.deviations:
+            notify("; ".join(filter(None, (str(moved), moved.advice(setting)))))
         if moved is not None and moved.creation:
-            notify(moved.creation)
+            notify("; ".join(filter(None, (moved.creation, moved.calming(setting)))))
         return count
 
     def _scene_ticks(self, scene: Scene) -> int:
@@ -564,7 +573,7 @@ class Run:
         if not self.as_json:
             for setup in bridge.setups:
                 announce(setup, self.coupling, is_method_chosen=options.method is not None)
-        with err.status("preparing …"):
+        with working("rehearsing the start of the run"):
             stack.enter_context(bridge)
         interrupts.hand_over(bridge.stop_on_signal)  # also while it closes: never cut short
         if window is not None:

@@ -42,7 +42,8 @@ along its normal, and friction takes energy; where the tank says otherwise the s
 with the law of other contacts. The exact inverse inertia of such a row is 0, so a step
 with one uses the approximate ones for all.
 
-Limits of joints and tendons are rows like those of a contact without friction. An equality
+Limits of joints and tendons are rows like those of a contact without friction; they hold a joint
+at the scene's own margin from the end of its range, as MuJoCo's do. An equality
 constraint has ŵ = −σ β p/h − (1 − σ) δp/h for an error p of either sign; δp is the part of p that a
 moved mocap body added. All these rows share the tank, so the tank also pays for an error that
 exists at the start. MuJoCo subtracts h J̇v from ŵ of ``connect`` and ``weld``; a repeated step does
@@ -443,6 +444,16 @@ def _is_held(s: State, kind: int, i: int) -> bool:
 
 
 @compiled
+def _limit_margin(s: State, kind: int, i: int) -> float:
+    """Returns the scene's own margin of a limit in m or rad, at which MuJoCo's limits rest."""
+    if kind == LIMIT_JOINT:
+        return float(floats(s.contact.own_jnt_margin, i + 1)[i])
+    if kind == LIMIT_TENDON:
+        return float(floats(s.contact.own_tendon_margin, i + 1)[i])
+    return 0.0
+
+
+@compiled
 def _aim_rows(s: State) -> None:
     """Does for limits and equality constraints what ``_aim`` does for contacts.
 
@@ -465,8 +476,9 @@ def _aim_rows(s: State) -> None:
         kind, i = kinds[row], ids[row]
         if not _is_held(s, kind, i):
             continue
-        is_in_error = own[row] < 0.0 or kind == EQUALITY
-        wanted = (-push if is_in_error else -1.0) * own[row] / h
+        distance = own[row] - _limit_margin(s, kind, i)
+        is_in_error = distance < 0.0 or kind == EQUALITY
+        wanted = (-push if is_in_error else -1.0) * distance / h
         if kind == EQUALITY and has_moved:
             wanted -= (1.0 - contact.push_ratio) * (own[row] - before[row]) / h
         wanted -= shifts[row]

@@ -4,6 +4,6 @@ Read ``bridge`` first, which is the loop. ``options`` are what a user chooses; `
 choice of all hands as a recording keeps it, and resolves to a setup for each hand. ``session``
 takes hold of scene, device and recording and releases them. ``hands`` describes several hands,
 ``commands`` what changes during a run, ``slow_scene`` a scene that is stepped beside the loop,
-``own_motion`` the substeps that a scene's own motion needs.
+``fidelity`` compares a scene's own motion with its file's.
 ``description`` writes and reads the metadata of a recording; ``summary`` says how the run went.
 """

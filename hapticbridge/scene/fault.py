@@ -14,24 +14,72 @@ from hapticbridge.scene.load import SceneSource
 from hapticbridge.scene.scene import Scene
 from hapticbridge.scene.source_map import Place, Places
 
+FAILS = {
+    "angle unit": True,
+    "divergence": True,
+    "energy created": True,
+    "impossible inertia": True,
+    "missing inertia": True,
+    "motion not finished": True,
+    "MuJoCo warning": True,
+    "not passive": True,
+    "pump": True,
+    "pyramidal cone": True,
+    "start not finite": True,
+    "units": True,
+    "unmetered work": True,
+    "workspace": True,
+    "box edges": False,
+    "changed": False,
+    "creeping friction": False,
+    "default contact": False,
+    "density of water": False,
+    "energy in the slack": False,
+    "falling body": False,
+    "far grip": False,
+    "heavy tool": False,
+    "keyframe": False,
+    "margin": False,
+    "mass ratio": False,
+    "mesh faces": False,
+    "mesh not convex": False,
+    "motor": False,
+    "own motion": False,
+    "rate": False,
+    "soft contact": False,
+    "soft equality": False,
+    "soft limit": False,
+    "solver iterations": False,
+    "starts in contact": False,
+    "time step": False,
+    "time step matters": False,
+    "visual geom with mass": False,
+}
+"""Kinds of findings, and if a run fails with one. It fails if it does not start, diverges, gets
+energy that no guarantee covers, or leaves the device's reach; so probably if the file's units are
+wrong. Other findings are notes: the run works, and a change would make it feel better."""
+
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault of a scene.
+    """One finding on a scene.
 
     Attributes:
-        kind: Name of the kind of fault.
+        kind: Name of the kind, one of ``FAILS``.
         place: File, line and element.
         sentence: Description with its numbers.
         change: Text to write at the place.
-        is_note: True if a run works as well without the change; the scene counts as sound.
     """
 
     kind: str
     place: Place
     sentence: str
     change: str
-    is_note: bool = False
+
+    @property
+    def is_note(self) -> bool:
+        """True if a run works without the change; the scene counts as sound."""
+        return not FAILS[self.kind]
 
 
 def number(value: float) -> str:

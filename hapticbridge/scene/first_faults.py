@@ -56,7 +56,6 @@ def motor_faults(case: CompiledScene) -> Iterator[Fault]:
             f"actuator '{name}' pushes {driven_name(model, actuator)} with {number(force)} {unit} "
             "from the start on; no guarantee covers what a motor gives the hand",
             _motor_change(model, data, actuator, is_alone=len(own) == 1),
-            is_note=True,
         )
 
 

@@ -88,11 +88,11 @@ def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Sta
         last = _violations(trial, data)
     still = {row: size for row, size in last.items() if size > VIOLATION}
     remaining = [
-        f"{_row_name(model, row)} starts {_off(model, row, still[row])}, and stays so"
+        f"{row_name(model, row)} starts {_off(model, row, still[row])}, and stays so"
         for row in still
     ]
     words = [
-        f"start of {_row_name(model, row)}: {_off(model, row, size)} → closed"
+        f"start of {row_name(model, row)}: {_off(model, row, size)} → closed"
         for row, size in first.items()
         if size > VIOLATION and row not in still and row[0] != "joint"
     ]
@@ -124,12 +124,13 @@ def _projected(trial: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64
 
 
 def _clamp_joints(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Moves hinges and slides into their limits, without any other joint."""
+    """Moves hinges and slides to their limits' margins, where MuJoCo's limits rest, alone."""
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_LIMIT:
         return
     single = (model.jnt_limited != 0) & (model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))
     places, (low, high) = model.jnt_qposadr[single], model.jnt_range[single].T
-    data.qpos[places] = np.clip(data.qpos[places], low, high)
+    margin = np.minimum(model.jnt_margin[single], 0.5 * (high - low))
+    data.qpos[places] = np.clip(data.qpos[places], low + margin, high - margin)
 
 
 def _without_forces(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -146,7 +147,6 @@ def _without_forces(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjDat
     for name in ("eq_sol{}", "jnt_sol{}", "tendon_sol{}_lim"):
         getattr(trial, name.format("ref"))[:] = -1.0, 0.0
         getattr(trial, name.format("imp"))[:] = STIFF, STIFF, 1.0, 0.5, 2.0
-    trial.jnt_margin[:] = trial.tendon_margin[:] = 0.0
     data = mujoco.MjData(trial)
     reset(trial, data)
     data.qvel[:] = 0.0
@@ -154,10 +154,32 @@ def _without_forces(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjDat
     return trial, data
 
 
+def constraint_name(model: mujoco.MjModel, data: mujoco.MjData, row: int) -> str:
+    """Returns the name of the constraint that a row of the data belongs to."""
+    kind, number = int(data.efc_type[row]), int(data.efc_id[row])
+    if kind in _ROWS:
+        limit = "" if _ROWS[kind] == "equality" else "the limit of "
+        return limit + row_name(model, (_ROWS[kind], number))
+    if kind == int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF):
+        joint = int(model.dof_jntid[number])
+        return f"the friction of joint '{model.joint(joint).name or joint}'"
+    if kind == int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON):
+        return f"the friction of tendon '{model.tendon(number).name or number}'"
+    sides = [int(geom) for geom in data.contact[number].geom if geom >= 0]
+    names = [
+        f"geom '{model.geom(i).name}'"
+        if model.geom(i).name
+        else f"body '{model.body(int(model.geom_bodyid[i])).name}'"
+        for i in sides
+    ]
+    return f"the contact of {' and '.join(names) or 'a flex'}"
+
+
 def _violations(model: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, int], float]:
     """Returns the largest violation in m or rad of each limit and equality constraint."""
     sizes: dict[tuple[str, int], float] = {}
-    for kind, number, distance in zip(data.efc_type, data.efc_id, data.efc_pos, strict=True):
+    distances = data.efc_pos - data.efc_margin
+    for kind, number, distance in zip(data.efc_type, data.efc_id, distances, strict=True):
         row = _ROWS.get(int(kind), ""), int(number)
         is_equality = row[0] == "equality"
         if not row[0] or (is_equality and int(model.eq_type[number]) not in _KINDS):
@@ -167,7 +189,8 @@ def _violations(model: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, i
     return sizes
 
 
-def _row_name(model: mujoco.MjModel, row: tuple[str, int]) -> str:
+def row_name(model: mujoco.MjModel, row: tuple[str, int]) -> str:
+    """Returns the name of a constraint, given as its kind in ``_ROWS`` and its number."""
     kind, number = row
     if kind != "equality":
         return f"{kind} '{getattr(model, kind)(number).name or number}'"

@@ -1,0 +1,601 @@
+"""Fidelity of a scene: its motion without a hand in the bridge, against the one of its file."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from enum import Enum
+from itertools import pairwise
+from typing import NamedTuple, Self
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import RIGID
+from hapticbridge.demand.rehearsal import RunPoint, rehearsal_parameters
+from hapticbridge.errors import SceneError
+from hapticbridge.kernel.codes import OK, added_actuators, held_body
+from hapticbridge.kernel.jit import direct
+from hapticbridge.kernel.mujoco_c import quiet
+from hapticbridge.kernel.parameters import MAX_SUBSTEPS
+from hapticbridge.kernel.record import SAMPLE_DTYPE
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import after_step, before_step
+from hapticbridge.scene import Scene, SceneSource, plain_model
+from hapticbridge.scene.checks import ancestors
+from hapticbridge.scene.compile import reset
+from hapticbridge.scene.handle import copy_values
+from hapticbridge.scene.rehearsal import holding_force
+from hapticbridge.scene.start import constraint_name
+from hapticbridge.units import format_si
+
+SECONDS = 1.0
+"""Time in s that is compared. Later, contacts and chains amplify any difference."""
+
+MAX_WORK = 1e5
+"""Largest work of one motion at the start of a run, in degrees of freedom and constraint rows,
+summed over its steps: 0.3 to 0.7 s. Heavier scenes are compared over less than ``SECONDS`` there,
+without a trial of remedies, and in full by a check."""
+
+PLACE, TURN = 1e-3, 0.01
+"""Largest distance in m and angle in rad between two places of a body that count as one: what
+fingers just notice on 10 to 20 mm, and 1 mm at 0.1 m from an axis."""
+
+SPREAD = 3.0
+"""Difference that counts, relative to that between two motions of the file, one of them with half
+its time step; no unit. MuJoCo's steps are of first order: with ever smaller ones the file's own
+motion ends twice as far away, and there a finer step of the run may end too."""
+
+CHAOS = 10.0
+"""Difference between two motions of the file, relative to the limits, from which on none of them is
+its motion; no unit. Where it grows to 1 cm, chance decides whether a third is farther away."""
+
+DISTURBANCE = 1e-6
+"""Disturbance in m or rad of the start in the file's other motion, far below what is seen."""
+
+MORE = 1.0
+"""Force in N of a still hand by which a remedy may exceed that without it. A remedy that lets the
+hand bear more is none: it would begin with a push."""
+
+NOTABLE_ENERGY = 1e-4
+"""Energy in J that a scene may create without a hand and without a word: a tenth of what a hand
+puts in when it taps."""
+
+ROUNDING = 1e-9
+"""Relative error of a time step as it is written."""
+
+HELD = 1e6
+"""Inertia in kg and kg m² that a hand adds to a tool which it holds still. The tool then falls by
+1 µm in a second; more would cost digits of the other bodies' accelerations."""
+
+NO_HAND = Coupling(1e-6, 0.0)
+"""Coupling that carries nothing: 1 N at 1000 km."""
+
+
+class Cause(Enum):
+    """Replacement of the bridge that makes a scene move differently, in the order of the trials.
+
+    The value is its name.
+    """
+
+    LOAD = "what is changed in the scene as it is loaded"
+    OPTIONS = "the integrator and the solver's options"
+    TIME_STEP = "the time step"
+    METHOD = "the method's own steps, which take back energy that joints create"
+    CONTACT = "rigid contacts in place of the file's own"
+
+
+class Places(NamedTuple):
+    """Centres of mass (n, 3) in m and orientations (n, 4) of all bodies."""
+
+    position: NDArray[np.float64]
+    orientation: NDArray[np.float64]
+
+    def apart(self, other: Places) -> NDArray[np.float64]:
+        """Returns distance in m and angle in rad between the places of each body, (2, n)."""
+        lag = np.abs(np.einsum("ij,ij->i", self.orientation, other.orientation))
+        angle = 2.0 * np.arccos(np.minimum(lag, 1.0))
+        return np.array([np.linalg.norm(self.position - other.position, axis=1), angle])
+
+
+def _size(apart: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns differences relative to ``PLACE`` and ``TURN``, the larger of both, (n,)."""
+    return np.asarray((apart.T / (PLACE, TURN)).max(axis=1))
+
+
+class Deviation(NamedTuple):
+    """Body that moves differently in the bridge.
+
+    Attributes:
+        body: Name of the body, or its number if it has none.
+        apart: Distance in m between its two places at the end; inf if the scene diverges here.
+        turned: Angle in rad between its two orientations at the end.
+        moved: Distance in m that it moves under the file's own options.
+        number: Number of the body in the file's model.
+    """
+
+    body: str
+    apart: float
+    turned: float
+    moved: float
+    number: int = 0
+
+    @property
+    def size(self) -> float:
+        """The difference relative to ``PLACE`` and ``TURN``, the larger of both."""
+        return max(self.apart / PLACE, self.turned / TURN)
+
+
+@dataclass(frozen=True, slots=True)
+class Fidelity:
+    """Comparison of two motions of a scene without a hand.
+
+    Attributes:
+        deviations: Bodies that move differently in the bridge, that with the largest size first.
+        incomparable: Bodies whose place the file itself does not determine.
+        bodies: Number of bodies that can move while a hand holds the tool.
+        step: The file's own time step in s.
+        seconds: Time in s that was compared.
+        created: Energy in J that the scene created meanwhile in the bridge.
+        causes: Replacements that move the first of the deviations furthest.
+        constraint: Name of the constraint of the file whose force does most of the work between
+            both places of its body; empty if none does.
+        remedy: Rate, substeps and contact with which no body deviates, tried; None without one.
+        force: Largest force in N with which a still hand holds the tool with the remedy.
+        calmer: Substeps and contact with which the scene creates no energy, tried; None without.
+    """
+
+    deviations: tuple[Deviation, ...]
+    incomparable: tuple[str, ...]
+    bodies: int
+    step: float
+    seconds: float
+    created: float
+    causes: tuple[Cause, ...] = ()
+    constraint: str = ""
+    remedy: RunPoint | None = None
+    force: float = 0.0
+    calmer: RunPoint | None = None
+
+    @property
+    def size(self) -> float:
+        """Largest difference relative to ``PLACE`` and ``TURN``; 0 if no body deviates."""
+        return self.deviations[0].size if self.deviations else 0.0
+
+    def __str__(self) -> str:
+        """The deviation as a sentence; empty if there is none."""
+        if not self.deviations:
+            return ""
+        first, *others = self.deviations
+        step = f"time step {format_si(self.step, 's')}"
+        if math.isinf(first.apart):
+            return (
+                f"without a hand, the scene diverges here within {self.seconds:.2g} s, and not "
+                f"under the file's own options ({step})"
+            )
+        more = f", and {len(others)} more bodies deviate" if others else ""
+        cause = " and ".join(each.value for each in self.causes)
+        if self.constraint and Cause.CONTACT in self.causes:
+            cause += f", here of {self.constraint}"
+        return (
+            f"without a hand, '{first.body}' is after {self.seconds:.2g} s "
+            f"{format_si(first.apart, 'm')} and {np.rad2deg(first.turned):.2g} deg from where the "
+            f"file's own options take it ({format_si(first.moved, 'm')} from its start, {step})"
+            f"{more}; the cause is {cause}"
+        )
+
+    @property
+    def doubt(self) -> str:
+        """Sentence on bodies whose place the file does not determine; empty without."""
+        if not self.incomparable:
+            return ""
+        first, *others = self.incomparable
+        more = f" and of {len(others)} more bodies" if others else ""
+        return (
+            f"without a hand, the place of '{first}'{more} after {self.seconds:.2g} s depends on "
+            f"the file's time step of {format_si(self.step, 's')}: with half of it, it is about as "
+            "far away as in a run"
+        )
+
+    @property
+    def creation(self) -> str:
+        """Sentence on energy that the scene creates; empty if there is hardly any.
+
+        Fast joints create it in MuJoCo's steps. It is taken back (``kernel.ledger``) unless
+        contacts of the scene's own act.
+        """
+        if not NOTABLE_ENERGY < self.created < math.inf:
+            return ""
+        return (
+            f"without a hand, the scene creates {format_si(self.created, 'J')} within "
+            f"{self.seconds:.2g} s, as fast joints do in MuJoCo's steps, and the audit may call it "
+            "active"
+        )
+
+    def advice(self, setting: RunPoint) -> str:
+        """Returns options of a run that mend a deviation, and what they gave; empty without."""
+        if self.remedy is None:
+            return ""
+        return (
+            f"{_flags(self.remedy, setting)} (tried: each body is then within "
+            f"{format_si(PLACE, 'm')}, and a still hand holds the tool with at most "
+            f"{format_si(self.force, 'N')})"
+        )
+
+    def calming(self, setting: RunPoint) -> str:
+        """Returns options of a run with which the scene creates no energy; empty without."""
+        if self.calmer is None:
+            return ""
+        return f"{_flags(self.calmer, setting)} (tried: it then creates none)"
+
+
+def _flags(changed: RunPoint, setting: RunPoint) -> str:
+    """Returns the options of ``hapticbridge run`` that change a setting into another one."""
+    flags = {
+        f"--rate {1.0 / changed.period:g}": changed.period != setting.period,
+        f"--substeps {changed.substeps}": changed.substeps != setting.substeps,
+        f"--contact {changed.contact}": changed.contact != setting.contact,
+    }
+    return " ".join(flag for flag, is_changed in flags.items() if is_changed)
+
+
+def fidelity(
+    source: SceneSource, scene: Scene, setting: RunPoint, *, max_work: float = math.inf
+) -> Fidelity | None:
+    """Compares the first second without a hand with that of the file's own options.
+
+        size = max(‖p − q‖/1 mm, |θ_p − θ_q|/0.01 rad)
+
+    with a body's centre of mass p under the file's own integrator, time step, solver and contacts,
+    and q in the bridge. Both start as the run does, on the file's constraints, with its controls
+    and without the mocap bodies that the hand replaces (``Scene.differences`` names both). A tool
+    that the file lets move by ``CHAOS`` is held in both at the joints without a motor's force, as
+    by a hand at rest.
+
+    A body deviates if its size is above 1 and above ``SPREAD`` times that between the file's motion
+    and a second one of it, with half the time step and a start disturbed by ``DISTURBANCE``, and if
+    the latter is below ``CHAOS``. A body of size above 1 that does not is incomparable: the file
+    does not determine its place.
+
+    Args:
+        source: The scene; it is not changed.
+        scene: Result of ``compile_scene`` from it; prepared here, and not at its start afterwards.
+        setting: Rate, substeps and contact of both, and the coupling of a hand that tries a remedy.
+        max_work: Largest work of one motion (``MAX_WORK``), which shortens it.
+
+    Returns:
+        The comparison, or None if the file's own options let the scene diverge.
+
+    Raises:
+        SceneError: The scene does not compile.
+
+    References:
+        Durlach, Delhorne, Wong, Ko, Rabinowitz & Hollerbach, Perception & Psychophysics 46, 1989:
+        1 mm for lengths of 10 to 20 mm between the fingers.
+    """
+    with quiet():
+        alone = _FileMotion.simulate(source, scene, max_work)
+        return None if alone is None else alone.against(scene, setting)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _FileMotion:
+    """Motion of a scene's bodies under the file's own options, from the run's start.
+
+    ``data`` is at the start, ``last`` at the end.
+    """
+
+    data: mujoco.MjData
+    last: mujoco.MjData
+    start: Places
+    end: Places
+    count: int
+    held: NDArray[np.intp]
+
+    @classmethod
+    def simulate(cls, source: SceneSource, scene: Scene, max_work: float) -> Self | None:
+        """Moves the scene; returns None if it diverges."""
+        model = plain_model(source)
+        model.eq_active0[:] = scene.model.eq_active0[: model.neq]
+        data = mujoco.MjData(model)
+        reset(model, data)
+        scene.reset()
+        data.qpos[:] = scene.data.qpos
+        data.ctrl[:] = scene.data.ctrl[: data.ctrl.size]
+        mujoco.mj_forward(model, data)
+        most = max_work / max(model.nv + data.nefc, 1)
+        count = max(int(min(round(SECONDS / model.opt.timestep), most)), 1)
+        start, end = _places(copy.copy(data)), _moved(model, data, count)
+        held = np.zeros(0, np.intp) if end is None else _loose_dofs(scene, start, end)
+        if held.size:
+            _hold(model, held)
+            mujoco.mj_forward(model, data)
+            end = _moved(model, data, count)
+        return None if end is None else cls(data, end, start, _places(copy.copy(end)), count, held)
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        return self.data.model
+
+    @property
+    def step(self) -> float:
+        return float(self.model.opt.timestep)
+
+    @property
+    def seconds(self) -> float:
+        return self.count * self.step
+
+    def against(self, scene: Scene, setting: RunPoint) -> Fidelity:
+        """Compares with the motion in the bridge, and looks for causes and remedies."""
+        here, found = self._compared(scene, setting)
+        way = np.zeros(self.model.nv)
+        mujoco.mj_differentiatePos(self.model, way, 1.0, scene.data.qpos, self.last.qpos)
+        if found.creation:
+            calm = (each for each in self._calmer(setting) if not self._tried(scene, each).creation)
+            found = replace(found, calmer=next(calm, None))
+        if not found.deviations:
+            return found
+        worst = found.deviations[0].number
+        causes = tuple(self._causes(scene, setting, here, worst))
+        found = replace(found, causes=causes, constraint=_working(self.last, worst, way))
+        if self.seconds < SECONDS - self.step:
+            return found  # too heavy for trials at the start of a run
+        most = _force(scene, setting) + MORE
+        for other in self._settings(setting):
+            trial = self._tried(scene, other)
+            if trial.deviations or trial.created > max(found.created, NOTABLE_ENERGY):
+                continue
+            if (force := _force(scene, other)) <= most:
+                return replace(found, remedy=other, force=force)
+        return found
+
+    def _tried(self, scene: Scene, setting: RunPoint) -> Fidelity:
+        """Compares a remedy; one that the scene refuses counts as one with which it diverges."""
+        try:
+            return self._compared(scene, setting)[1]
+        except SceneError:  # its own contacts refuse a tool that starts inside something
+            return replace(self._diverged, created=math.inf)
+
+    def _compared(self, scene: Scene, setting: RunPoint) -> tuple[Places | None, Fidelity]:
+        """Returns places in the bridge, None if it diverges, and what deviates."""
+        created = self._moved_here(scene, replace(setting, coupling=NO_HAND))
+        if math.isinf(created):
+            return None, self._diverged
+        found = Fidelity((), (), int(self._are_free().sum()), self.step, self.seconds, created)
+        here = self._places(scene.data)
+        apart = here.apart(self.end)
+        sizes = np.where(self._are_free(), _size(apart), 0.0)
+        if sizes.max(initial=0.0) <= 1.0:
+            return here, found
+        moved, spread = self.start.apart(self.end)[0], self._spread()
+        allowed = np.where(spread < CHAOS, SPREAD * spread, math.inf)
+        names = [str(self.model.body(i).name) or str(i) for i in range(self.model.nbody)]
+        worst = [int(i) for i in np.argsort(-sizes) if sizes[i] > 1.0]
+        return here, replace(
+            found,
+            deviations=tuple(
+                Deviation(names[i], float(apart[0, i]), float(apart[1, i]), float(moved[i]), i)
+                for i in worst
+                if sizes[i] > allowed[i]
+            ),
+            incomparable=tuple(names[i] for i in worst if sizes[i] <= allowed[i]),
+        )
+
+    @property
+    def _diverged(self) -> Fidelity:
+        lost = (Deviation("", math.inf, 0.0, math.inf),)
+        return Fidelity(lost, (), int(self._are_free().sum()), self.step, self.seconds, math.inf)
+
+    def _are_free(self) -> NDArray[np.bool_]:
+        """Returns True for each body that can move while the tool is held."""
+        model, free = self.model, np.zeros(self.model.nbody, bool)
+        free[np.delete(model.dof_bodyid, self.held)] = True
+        for body in range(1, model.nbody):  # parents come first
+            free[body] |= free[model.body_parentid[body]]
+        return free
+
+    def _spread(self) -> NDArray[np.float64]:
+        """Returns the size of the difference to a second motion of the file, (nbody,)."""
+        model = copy.copy(self.model)
+        model.opt.timestep /= 2.0
+        rng = np.random.default_rng(0)
+        step = rng.uniform(-DISTURBANCE, DISTURBANCE, model.nv)
+        other = _moved(model, self.data, 2 * self.count, step)
+        if other is None:
+            return np.full(model.nbody, math.inf)
+        return _size(_places(other).apart(self.end))
+
+    def _settings(self, setting: RunPoint) -> Iterator[RunPoint]:
+        """Yields settings of a run that undo one replacement or two."""
+        own = _with_step(setting, self.step)
+        if own != setting:
+            yield own
+        if setting.contact == RIGID:
+            yield replace(setting, contact="scene")
+            if own != setting:
+                yield replace(own, contact="scene")
+
+    def _calmer(self, setting: RunPoint) -> Iterator[RunPoint]:
+        """Yields settings of a run in which fast joints may create less energy."""
+        if setting.contact != RIGID:
+            yield replace(setting, contact="rigid")
+        yield replace(setting, substeps=min(2 * setting.substeps, MAX_SUBSTEPS))
+
+    def _causes(
+        self, scene: Scene, setting: RunPoint, here: Places | None, body: int
+    ) -> Iterator[Cause]:
+        """Yields the replacements that move a body furthest, or at least half as far.
+
+        The file's motion gets one replacement after the other, until it is that of the bridge;
+        ``here`` is None where that diverges.
+        """
+        motions = [self.end, *self._replaced(scene)]
+        with suppress(SceneError):  # its own contacts refuse a tool that starts inside something
+            motions.append(self._compared(scene, replace(setting, contact="scene"))[0])
+        motions += [motions[-1]] * (len(Cause) - len(motions)) + [here]
+        known = [each for each in motions if each is not None]
+        if len(known) < len(motions):
+            yield list(Cause)[motions.index(None) - 1]
+            return
+        sizes = [float(_size(after.apart(before))[body]) for before, after in pairwise(known)]
+        for cause, size in zip(Cause, sizes, strict=True):
+            if size >= 0.5 * max(sizes):
+                yield cause
+
+    def _replaced(self, scene: Scene) -> Iterator[Places | None]:
+        """Yields the file's motion with the changed scene, then its options, then its time step."""
+        scene.set_contact(is_rigid=False)
+        model, own = copy.copy(scene.model), scene.model.opt.timestep
+        for name in ("gainprm", "biasprm"):
+            getattr(model, f"actuator_{name}")[list(added_actuators(model))] = 0.0
+        _hold(model, self.held)
+        scene.reset()
+        for options, step in (
+            (self.model.opt, self.step),
+            (scene.model.opt, self.step),
+            (scene.model.opt, own),
+        ):
+            copy_values(options, model.opt)
+            model.opt.timestep = step
+            end = _moved(model, scene.data, max(round(self.seconds / step), 1))
+            yield None if end is None else self._places(end)
+
+    def _places(self, data: mujoco.MjData) -> Places:
+        """Returns the places of the file's bodies in a scene with handle."""
+        return _places(copy.copy(self.data), data.qpos)
+
+    def _moved_here(self, scene: Scene, setting: RunPoint) -> float:
+        """Moves a scene by its ticks in the bridge.
+
+        Returns:
+            The energy in J that it created; inf if it diverges.
+        """
+        parameters, model = rehearsal_parameters(scene, setting), scene.model
+        inertia = model.dof_armature.copy(), model.dof_M0.copy()
+        _hold(model, self.held)
+        binding = BoundKernel(scene.model, scene.data, parameters)
+        state, row, step = binding.state, binding.row, binding.step
+        still, period = np.zeros(1, SAMPLE_DTYPE), setting.period
+        still["quaternion"][:, 0] = 1.0
+        before = direct(before_step, state, still, row, 0, period)
+        after = direct(after_step, state, row, 0)
+        try:
+            for _ in range(max(round(self.seconds / period), 1)):
+                for substep in range(setting.substeps):
+                    if before(state, still, row, substep, period) != OK:
+                        return math.inf
+                    step(scene.model, scene.data)
+                    if after(state, row, substep) != OK:
+                        return math.inf
+            return float(state[0]["energy"]["environment_energy"])
+        finally:
+            binding.release()
+            model.dof_armature[:], model.dof_M0[:] = inertia  # to the last bit, as a run follows
+
+
+def _force(scene: Scene, setting: RunPoint) -> float:
+    """Returns the largest force in N with which a still hand holds the tool; inf if it cannot."""
+    try:
+        return holding_force(scene, rehearsal_parameters(scene, setting))
+    except SceneError:
+        return math.inf
+
+
+def _working(data: mujoco.MjData, body: int, way: NDArray[np.float64]) -> str:
+    """Returns the name of the constraint whose force does the most work on a body's joints.
+
+    ``way`` (nv,) is that of the joints from one place to another; empty if there is no work.
+    """
+    model = data.model
+    rows = np.zeros((data.nefc, model.nv))
+    if mujoco.mj_isSparse(model) and data.nefc:
+        mujoco.mju_sparse2dense(
+            rows, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
+        )
+    elif data.nefc:
+        rows = data.efc_J.reshape(data.nefc, model.nv)
+    chain = np.isin(model.dof_bodyid, ancestors(model, body))
+    work = np.abs(data.efc_force * (rows[:, chain] @ way[chain]))
+    return constraint_name(model, data, int(np.argmax(work))) if work.any() else ""
+
+
+def _loose_dofs(scene: Scene, start: Places, end: mujoco.MjData) -> NDArray[np.intp]:
+    """Returns the degrees of freedom that carry tools which fall or swing without a hand."""
+    found = np.zeros(0, np.intp)
+    sizes = _size(_places(copy.copy(end)).apart(start))
+    for grip in (scene.grip, *scene.other_grips):
+        tool = held_body(scene.model, grip)
+        chain = np.flatnonzero(np.isin(end.model.dof_bodyid, ancestors(scene.model, tool)))
+        if sizes[tool] > CHAOS:
+            found = np.union1d(found, chain[end.qfrc_actuator[chain] == 0.0])
+    return found.astype(np.intp)
+
+
+def _hold(model: mujoco.MjModel, dofs: NDArray[np.intp]) -> None:
+    """Adds inertia to degrees of freedom; MuJoCo reads ``dof_M0`` for bodies alone in a tree."""
+    model.dof_armature[dofs] += HELD
+    model.dof_M0[dofs] += HELD
+
+
+def _moved(
+    model: mujoco.MjModel,
+    start: mujoco.MjData,
+    count: int,
+    disturbance: NDArray[np.float64] | None = None,
+) -> mujoco.MjData | None:
+    """Returns the data after so many of MuJoCo's steps; None if it diverges."""
+    data = copy.copy(start)
+    if disturbance is not None:
+        mujoco.mj_integratePos(model, data.qpos, disturbance, 1.0)
+    mujoco.mj_step(model, data, count)
+    return None if any(warning.number for warning in data.warning) else data
+
+
+def _places(data: mujoco.MjData, positions: NDArray[np.float64] | None = None) -> Places:
+    """Returns the places of all bodies, at the data's own or at other positions (nq,)."""
+    if positions is not None:
+        data.qpos[:] = positions
+    mujoco.mj_kinematics(data.model, data)
+    mujoco.mj_comPos(data.model, data)
+    return Places(data.xipos.copy(), data.xquat.copy())
+
+
+def own_substeps(
+    source: SceneSource, scene: Scene, setting: RunPoint
+) -> tuple[int, Fidelity | None]:
+    """Returns the substeps that keep the file's own time step, and the motion with them.
+
+    There is one if the file's step is not shorter than T, or if no body deviates with one, or not
+    less with more.
+
+    Args:
+        source: The scene; it is not changed.
+        scene: As for ``fidelity``.
+        setting: Period and contact; coupling and substeps are not used.
+
+    Raises:
+        SceneError: The scene does not compile.
+    """
+    with quiet():
+        alone = _FileMotion.simulate(source, scene, MAX_WORK)
+        if alone is None:
+            return 1, None
+        own = _with_step(replace(setting, substeps=1), alone.step)
+        one = alone.against(scene, replace(setting, substeps=1))
+        if not one.deviations or own.substeps <= 1:
+            return 1, one
+        _, more = alone._compared(scene, own)
+    return (own.substeps, more) if more.size < one.size else (1, one)
+
+
+def _with_step(setting: RunPoint, step: float) -> RunPoint:
+    """Returns a setting whose scene has a time step in s, or as many substeps as there may be."""
+    if step > (1.0 + ROUNDING) * setting.period:
+        return replace(setting, period=step, substeps=1)
+    count = math.ceil(setting.period / step - ROUNDING)
+    return replace(setting, substeps=min(count, MAX_SUBSTEPS))
