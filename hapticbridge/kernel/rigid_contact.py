@@ -186,7 +186,7 @@ _OF_DATA = ("geom_xpos", "subtree_com", "cdof", "ten_velocity")
 _OWNED = (
     *(f"own_{name}" for name in _PARAMETERS),
     *("eq_type", "row_positions", "row_shifts", "end_velocity", "moving_geoms", "body_velocity"),
-    *("leashes", "blocked"),
+    *("leashes", "blocked", "geom_rest", "pair_rest"),
 )
 
 RIGID_DTYPE = np.dtype(
@@ -200,6 +200,7 @@ RIGID_DTYPE = np.dtype(
         ("pressing", "<i8"),
         ("is_sparse", "<i8"),
         ("leads", "<i8"),
+        ("has_margins", "<i8"),
         ("solver", "<i8"),
         ("own_solver", "<i8"),
         ("statistics", "<i8"),
@@ -224,7 +225,9 @@ force; ``push_ratio`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_e
 the last tick. ``is_aimed`` is 1 from the edit to the end of the step, ``corrections`` counts its
 repetitions for sliding, and ``lift`` is the largest velocity in m/s subtracted for it; ``ahead``
 the time in s for which margins reach ahead, and ``largest_margin`` their largest in m. ``leads`` is
-1 if the tool's margins follow the handle's speed, too. ``is_shifted`` is 1 if the step was repeated
+1 if the tool's margins follow the handle's speed, too. ``geom_rest`` and ``pair_rest`` are the
+file's own margins in m, at which contacts rest, and ``has_margins`` is 1 if there are any.
+``is_shifted`` is 1 if the step was repeated
 without −h J̇v. ``pressing`` counts the blocked contacts in penetration, and ``blocked`` is the
 address of h R N of each row in m/s, −1 where it is none; ``is_sparse`` is 1 if MuJoCo's Jacobian
 is. ``solver`` is the address of MuJoCo's choice, ``own_solver`` that of the scene; ``stalled`` is
@@ -258,6 +261,9 @@ def bind_contact(
     owned: dict[str, NDArray[np.generic]] = {
         f"own_{name}": getattr(model, name).copy() for name in _PARAMETERS
     }
+    for name in ("geom", "pair"):
+        owned[f"{name}_rest"] = own_margins(model, name)
+        contact["has_margins"] |= np.any(owned[f"{name}_rest"])
     owned["eq_type"] = np.ascontiguousarray(model.eq_type, dtype=np.int32)
     for name in ("row_positions", "row_shifts"):
         owned[name] = np.zeros(max(int(contact["row_capacity"]), 1))
@@ -279,10 +285,52 @@ def bind_contact(
     return owned
 
 
+def own_margins(model: mujoco.MjModel, kind: str) -> NDArray[np.float64]:
+    """Returns the file's margins in m of a model whose contacts are rigid.
+
+    Args:
+        model: A model with the margins of ``rigid_margins``.
+        kind: ``geom`` or ``pair``.
+    """
+    margins = getattr(model, f"{kind}_margin") - MARGIN
+    is_overridden = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE
+    return np.where((margins > _ROUNDING) & (not is_overridden), margins, 0.0)
+
+
+_ROUNDING = 1e-9
+"""Margin in m below which a file has none."""
+
+
+def rigid_margins(margins: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the margins in m with which rigid contacts are seen before they close.
+
+    Args:
+        margins: Those of the file in m, at which its contacts rest.
+    """
+    return np.where(margins > 0.0, margins + MARGIN, MARGIN)
+
+
 def restore_model(model: mujoco.MjModel, owned: dict[str, NDArray[np.generic]]) -> None:
     """Puts back what a run writes to the model, from the arrays of ``bind_contact``."""
     for name in _PARAMETERS:
         getattr(model, name)[...] = owned[f"own_{name}"]
+
+
+@compiled
+def opening(s: State, contact: int) -> float:
+    """Returns the distance in m of a contact's geoms from where it rests, at the file's margins."""
+    distance = float(floats(contact + s.mj.contact_distance, 1)[0])
+    geoms = ints(contact + s.mj.contact_geoms, 2)
+    if not s.contact.has_margins or min(geoms[0], geoms[1]) < 0:
+        return distance
+    firsts = ints(s.contact.pair_geom1, s.contact.pair_count)
+    seconds = ints(s.contact.pair_geom2, s.contact.pair_count)
+    for i in range(s.contact.pair_count):
+        is_pair = firsts[i] == geoms[0] and seconds[i] == geoms[1]
+        if is_pair or (firsts[i] == geoms[1] and seconds[i] == geoms[0]):
+            return distance - float(floats(s.contact.pair_rest, i + 1)[i])
+    rest = floats(s.contact.geom_rest, s.mj.ngeom)
+    return distance - float(rest[geoms[0]] + rest[geoms[1]])
 
 
 @compiled
@@ -310,7 +358,7 @@ def _aim(s: State) -> None:
             slide += (friction[j - 1] * velocities[row + j]) ** 2
             if s.contact.corrections > 0:
                 rest += (friction[j - 1] * ends[row + j]) ** 2
-        distance = floats(contact + mj.contact_distance, 1)[0]
+        distance = opening(s, contact)
         wanted = (-push if distance < 0.0 else -1.0) * distance / h
         if s.energy.mocap_has_moved:
             opened = max(opened_by_mocap(s, contact), 0.0)
@@ -389,7 +437,7 @@ def _blocked_mobility(s: State, contact: int) -> float:
         sideways = max(sideways, _mobility(s, row + j))
     if _mobility(s, row) > BLOCKED * sideways:
         return -1.0
-    return sideways if floats(contact + mj.contact_distance, 1)[0] < 0.0 else 0.0
+    return sideways if opening(s, contact) < 0.0 else 0.0
 
 
 @compiled
@@ -413,7 +461,7 @@ def _note_blocked(s: State) -> None:
         row, geoms = ints(contact + mj.contact_row, 1)[0], ints(contact + mj.contact_geoms, 2)
         if 0 <= row < MAX_ROWS and blocked[row] > 0.0:
             approximate = weights[2 * bodies[geoms[0]]] + weights[2 * bodies[geoms[1]]]
-            depth = -floats(contact + mj.contact_distance, 1)[0]
+            depth = -opening(s, contact)
             squared = max(floats(contact + mj.contact_friction, 1)[0] ** 2, SOFTNESS)
             regularisation = 4.0 * s.contact.pressing * squared * blocked[row]
             force = _stiffness_over_inertia(s, contact, depth) * depth / approximate
@@ -632,7 +680,7 @@ def _has_sunk(s: State) -> bool:
         row = ints(one + mj.contact_row, 1)[0]
         if row < 0 or ints(one + mj.contact_dim, 1)[0] == 1:
             continue
-        gap = max(floats(one + mj.contact_distance, 1)[0], 0.0)
+        gap = max(opening(s, one), 0.0)
         if gap + h * ends[row] < -SUNK:
             return True
     return False

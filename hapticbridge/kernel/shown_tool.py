@@ -79,6 +79,7 @@ from hapticbridge.kernel.pose import (
     subtract,
     vector_of,
 )
+from hapticbridge.kernel.rigid_contact import opening
 
 PLANES = 16
 """Largest number of surfaces that stop the shown tool between two steps of the scene."""
@@ -278,7 +279,7 @@ def _take_planes(s: State, scene: State) -> None:
         # the normal points from the first geom to the second
         normal = scaled(float(side), vector_of(floats(contact + mj.contact_frame, 3)))
         arm = subtract(vector_of(floats(contact + mj.contact_point, 3)), grip)
-        gap = max(floats(contact + mj.contact_distance, 1)[0], 0.0)
+        gap = max(opening(s, contact), 0.0)
         place = count
         if count < PLANES:
             count += 1

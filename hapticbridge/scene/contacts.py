@@ -181,39 +181,23 @@ SOFT_FREQUENCY = 15.0
 holds at 24 Hz. A hand moves at up to 10 Hz, and would feel a softer one yield."""
 
 
-def announce_rigid(model: mujoco.MjModel, margins: NDArray[np.float64]) -> tuple[SceneChange, ...]:
-    """Returns what rigid contacts and constraints change in a scene, each as ``name: old → new``.
-
-    Args:
-        model: The compiled scene.
-        margins: Margin in m of each geom in its file, (ngeom,).
-    """
+def announce_rigid(model: mujoco.MjModel) -> tuple[SceneChange, ...]:
+    """Returns what rigid contacts and constraints change, each as ``name: old → new``."""
+    changes = _soft_equalities(model)
     touches = (model.geom_contype | model.geom_conaffinity) != 0
-    wide = np.where(touches & (margins >= NOTABLE_MARGIN), margins, 0.0)
-    bounces = np.where(touches, [restitution(each) for each in model.geom_solref], 0.0)
-    bounces[bounces < NOTABLE_BOUNCE] = 0.0
-    said = (
-        (wide, "contacts of", f"from {1e3 * wide.max(initial=0.0):.3g} mm apart → on touch"),
-        (bounces, "bounce of", f"e = {bounces.max(initial=0.0):.2g} → 0"),
-    )
-    changes = [
-        SceneChange(f"{what} {_listed(model, values)}: {words} (--contact scene keeps it)")
-        for values, what, words in said
-        if values.any()
-    ]
-    return (*_soft_equalities(model), *changes)
+    bounces = np.array([restitution(each) for each in model.geom_solref]) * touches
+    others = np.count_nonzero(bounces >= NOTABLE_BOUNCE) - 1
+    if others >= 0:
+        name = geom_name(model, int(bounces.argmax()))
+        named = f"{name} and {others} more" if others else name
+        words = f"bounce of {named}: e = {bounces.max():.2g} → 0 (--contact scene keeps it)"
+        changes += (SceneChange(words),)
+    return changes
 
 
-NOTABLE_MARGIN, NOTABLE_BOUNCE = 1e-4, 0.2
-"""Margin in m, and coefficient of restitution, below which a rigid contact is not said to differ
-from the file's. Bodies in default contact bounce with 0.14."""
-
-
-def _listed(model: mujoco.MjModel, values: NDArray[np.float64]) -> str:
-    """Returns the name of the geom with the largest value, and the number of others."""
-    others = np.count_nonzero(values) - 1
-    first = geom_name(model, int(values.argmax()))
-    return f"{first} and {others} more" if others else first
+NOTABLE_BOUNCE = 0.2
+"""Coefficient of restitution below which a rigid contact is not said to differ from the file's.
+Bodies in default contact bounce with 0.14."""
 
 
 def restitution(solref: Sequence[float]) -> float:

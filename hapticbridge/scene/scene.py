@@ -23,7 +23,13 @@ from hapticbridge.kernel.codes import (
 from hapticbridge.kernel.colliders import use_exact_points
 from hapticbridge.kernel.mujoco_c import warning_of
 from hapticbridge.kernel.pose import IDENTITY_POSE
-from hapticbridge.kernel.rigid_contact import IMPRATIO, MARGIN, MAX_MARGIN, largest_margin
+from hapticbridge.kernel.rigid_contact import (
+    IMPRATIO,
+    MARGIN,
+    MAX_MARGIN,
+    largest_margin,
+    rigid_margins,
+)
 from hapticbridge.scene.compile import SceneChange, clause, go_to_start
 from hapticbridge.scene.contacts import announce_rigid
 from hapticbridge.scene.handle import (
@@ -36,6 +42,7 @@ from hapticbridge.scene.handle import (
 from hapticbridge.scene.source import SourceFile
 
 _MARGINS = ("geom_margin", "pair_margin", "flex_margin")
+_GAPS = ("geom_gap", "pair_gap", "flex_gap")
 _LIMIT_MARGINS = ("jnt_margin", "tendon_margin")
 _PRECISE = {"iterations": 100, "ls_iterations": 50, "tolerance": 1e-8, "ls_tolerance": 0.01}
 """MuJoCo's own limits of its solver. Where a file's are laxer, the solver may stop so early that
@@ -220,14 +227,14 @@ class Scene:
         """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
 
         Rigid contacts have an elliptic cone of friction, the regularisation of friction divided by
-        ``IMPRATIO``, no pass of the solver ``noslip``, a margin of ``MARGIN`` at least, limits of
+        ``IMPRATIO``, no pass of the solver ``noslip``, a margin beyond the file's, limits of
         the solver no laxer than MuJoCo's own, and the points of ``kernel.colliders``.
         """
         model, own = self.model, self._own_contact
         if is_rigid == bool(own):
             self._set_margins()
             return
-        said = announce_rigid(model, own.get("geom_margin", model.geom_margin))
+        said = announce_rigid(model)
         self.differences = tuple(each for each in self.differences if each not in said)
         if not is_rigid:
             self._restore_contact(model)
@@ -237,6 +244,7 @@ class Scene:
         needed = _rigid_options(model.opt)
         own = {name: getattr(model.opt, name) for name in needed}
         own |= {name: getattr(model, name).copy() for name in (*_MARGINS, *_LIMIT_MARGINS)}
+        own |= {name: getattr(model, name) - self._reach for name in _GAPS}
         self._own_contact = own  # a new object: copies of the scene share the old one
         for name, value in needed.items():
             setattr(model.opt, name, value)
@@ -246,10 +254,10 @@ class Scene:
     def _set_margins(self) -> None:
         """Sets the margins of rigid contacts at rest; in a run they follow the speed."""
         for name in _MARGINS if self._own_contact else ():
-            gap = getattr(self.model, name.replace("margin", "gap")) - self._reach
-            # a negative gap would let MuJoCo find a contact in penetration only
-            margin = np.maximum(self._own_contact[name], MARGIN) - np.minimum(gap, 0.0)
-            getattr(self.model, name)[:] = margin
+            getattr(self.model, name)[:] = rigid_margins(self._own_contact[name])
+        for name in _GAPS if self._own_contact else ():
+            # a negative gap would let MuJoCo see a contact in penetration only
+            getattr(self.model, name)[:] = np.maximum(self._own_contact[name], 0.0) + self._reach
         for name in _LIMIT_MARGINS if self._own_contact else ():
             getattr(self.model, name)[:] = self._own_contact[name]
         widest = largest_margin(self._period) if self._own_contact else 0.0
@@ -257,8 +265,9 @@ class Scene:
 
     def _restore_contact(self, model: mujoco.MjModel) -> None:
         for name, value in self._own_contact.items():
-            is_margin = name in (*_MARGINS, *_LIMIT_MARGINS)
-            setattr(model if is_margin else model.opt, name, value)
+            is_array = name in (*_MARGINS, *_LIMIT_MARGINS, *_GAPS)
+            own = value + self._reach if name in _GAPS else value
+            setattr(model if is_array else model.opt, name, own)
         _widen_bodies(model, 0.0)
         use_exact_points(model, is_used=False)
 
