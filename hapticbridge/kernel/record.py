@@ -103,7 +103,7 @@ the wrench that was sent, and of the device's motion to the next sample that the
 than the loop, and ``scene_tank`` is the energy in J that the hand has given and that scene has not
 yet got; both are 0 for a scene that steps in every tick (``kernel.shown_tool``)."""
 
-FORMAT = "3"
+FORMAT = "4"
 """Format of a recording: its fields, the request with its options, and the numbers that follow from
 it. A recording of another format is refused, so other fields in any of them need the next number.
 
