@@ -29,7 +29,7 @@ LIFTED = {
 """By how much a hand goes up in m before it is random: into the hole, onto the screw."""
 
 
-ALARM = int(TickFlag.SWINGING | TickFlag.RUNS_AWAY | TickFlag.UNANSWERED)
+ALARM = int(TickFlag.SWINGING | TickFlag.RUNS_AWAY)
 """Flags of what the watch finds."""
 
 
@@ -152,16 +152,14 @@ def bunched(
     return int(np.bitwise_or.reduce(flags)) & ALARM, late.max_net_energy()
 
 
-class OnItsStop:
-    """Handle on a rail that a hand pushes to the end of its way, with one motor.
+class BetweenStops:
+    """Handle on a rail that a hand shakes against a stop on each side; its motor is right.
 
     Args:
-        end: The mechanical stop in m.
-        sign: 1 for a motor that pushes as it is told, −1 for one that is reversed.
-        push: Force of the hand in N.
-        leaves: Time in s at which it pulls the handle back with 2 N.
-        stiffness: Stiffness of the stop in N/m.
-        step: Step of the encoder in m, whose last digit is not steady; 0 for a perfect one.
+        stop: Place in m, stiffness in N/m and damping in N s/m of each stop.
+        mass: Mass of handle and hand in kg.
+        hand: Stiffness in N/m and damping in N s/m of the hand.
+        shaking: Amplitude in m and frequency in Hz of where the hand wants to be.
     """
 
     info = hb.DeviceInfo(
@@ -173,62 +171,6 @@ class OnItsStop:
         is_delay_measured=True,
         is_real=False,
     )
-
-    def __init__(
-        self,
-        end: float,
-        sign: float,
-        push: float,
-        leaves: float = np.inf,
-        *,
-        stiffness: float = np.inf,
-        step: float = 0.0,
-    ) -> None:
-        self._end, self._sign, self._push, self._leaves = end, sign, push, leaves
-        self._stiffness, self._step = stiffness, step
-
-    def start(self, period: float) -> NDArray[np.void]:
-        self._period, self._tick = period, 0
-        self._digits = np.random.default_rng(0)
-        self._place = self._speed = self._force = 0.0
-        return np.array([((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)], hb.SAMPLE_DTYPE)
-
-    def read(self, sample: NDArray[np.void]) -> int:
-        if self._tick > 0:
-            hand = self._push if self._tick * self._period < self._leaves else -2.0
-            push = hand + self._sign * self._force - 2.0 * self._speed
-            deep = self._place - self._end
-            if deep > 0.0:
-                push -= self._stiffness * deep + np.sqrt(0.6 * self._stiffness) * self._speed
-            self._speed += self._period * push / 0.6
-            self._place += self._period * self._speed
-            if self._place > self._end and np.isinf(self._stiffness):
-                self._place, self._speed = self._end, min(self._speed, 0.0)
-        self._tick += 1
-        place = self._place
-        if self._step:
-            place = self._step * (np.floor(place / self._step) + self._digits.integers(2))
-        sample[0] = ((place, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)
-        return 0
-
-    def write(self, wrench: NDArray[np.float64]) -> None:
-        self._force = wrench[0]
-
-    def close(self) -> None:
-        self._force = 0.0
-
-
-class BetweenStops:
-    """Handle on a rail that a hand shakes against a stop on each side; its motor is right.
-
-    Args:
-        stop: Place in m, stiffness in N/m and damping in N s/m of each stop.
-        mass: Mass of handle and hand in kg.
-        hand: Stiffness in N/m and damping in N s/m of the hand.
-        shaking: Amplitude in m and frequency in Hz of where the hand wants to be.
-    """
-
-    info = OnItsStop.info
 
     def __init__(
         self,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from audit_cases import ScriptedDevice
 from faults.catalogue import FINGERS
 from model_runs import LOOP_SCENES
 from numpy.typing import NDArray
@@ -19,11 +17,9 @@ from own_attacks import PINNED
 from own_device import Drive, OwnDevice
 from random_hands import random_motion
 from swing_cases import (
-    ALARM,
     GRIPS,
     VERY_FIRM,
     BetweenStops,
-    OnItsStop,
     alarms,
     bunched,
     shakes,
@@ -33,7 +29,6 @@ from swing_cases import (
 import hapticbridge as hb
 from hapticbridge.audit import audit
 from hapticbridge.demand.guard import Limits
-from hapticbridge.demand.timekeeping import Alarm
 from hapticbridge.device import (
     AXES,
     DEFAULT_HAND,
@@ -134,162 +129,6 @@ def test_a_probe_lowers_the_force_for_a_moment_and_is_no_alarm(tmp_path: Path) -
     report = audit(path)
     assert report.verdict == summary.verdict
     assert report.resimulation == "bit for bit"
-
-
-def test_a_reversed_motor_that_holds_the_handle_on_its_stop_is_said_to_be_unknown(
-    tmp_path: Path,
-) -> None:
-    path = tmp_path / "run.mcap"
-    device = OnItsStop(0.012, -1.0, push=0.3)
-    with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock(), recording=path) as bridge:
-        summary = bridge.run(2.3)
-    assert summary.is_certified is False
-    assert "move the handle away from its stop" in str(summary)
-    ticks = hb.read_recording(path).ticks
-    assert np.abs(ticks["wrench_on_device"][:, 0]).max() > 4.0
-    assert (ticks["lever"][1500:] == 0.25).all()  # the force does not come back
-    report = audit(path)
-    assert report.resimulation == "bit for bit"
-    assert report.certified is False
-    assert "not known whether its motors push the right way" in report.reason
-
-
-@pytest.mark.parametrize(("sign", "push"), [(1.0, 8.0), (-1.0, 0.3)])
-def test_the_force_comes_back_off_the_stop_if_the_motor_is_right(sign: float, push: float) -> None:
-    device = OnItsStop(0.012, sign, push, leaves=1.8)
-    with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock()) as bridge:
-        bridge.run(2.3)
-        ticks = bridge.latest_records(2300)
-    assert ticks["lever"][1790] == 0.25
-    assert ticks["device_position"][-1, 0] < 0.009
-    assert ticks["lever"][-1] == (1.0 if sign > 0.0 else 0.0)
-
-
-@pytest.mark.parametrize(("stiffness", "step"), [(5e4, 0.0), (np.inf, 2e-5), (5e4, 2e-5)])
-@pytest.mark.parametrize("limit", [2.0, 10.0])
-def test_neither_a_soft_stop_nor_an_unsteady_digit_hides_a_reversed_motor(
-    stiffness: float, step: float, limit: float
-) -> None:
-    """The stop gives way by up to 0.1 mm, and the last digit changes at random."""
-    device = OnItsStop(0.011, -1.0, 0.3, stiffness=stiffness, step=step)
-    limits = Limits(force=limit, torque=0.5)
-    with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock(), limits=limits) as bridge:
-        summary = bridge.run(2.5)
-        share = bridge.latest_records(2500)["lever"]
-    assert summary.timekeeping.alarm is Alarm.UNANSWERED
-    assert (share[2000:] == 0.25).all()
-
-
-@pytest.mark.parametrize("step", [0.0, 2e-5])
-def test_a_hand_that_presses_into_a_soft_stop_is_acquitted(step: float) -> None:
-    """The stop rings at 46 Hz when the force is lowered."""
-    device = OnItsStop(0.012, 1.0, 8.0, stiffness=5e4, step=step)
-    with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock()) as bridge:
-        summary = bridge.run(2.5)
-        flags = bridge.latest_records(2500)["flags"]
-    assert np.bitwise_or.reduce(flags) & TickFlag.PROBED
-    assert not summary.timekeeping.alarm
-
-
-SPRUNG = """<mujoco><compiler angle="radian"/>
-<option timestep="0.001" integrator="discrete" cone="elliptic" gravity="0 0 0"/>
-<worldbody><body name="tool">
-  <joint name="x" type="slide" axis="1 0 0" stiffness="3000" damping="20"/>
-  <joint name="y" type="slide" axis="0 1 0" stiffness="3000" damping="20"/>
-  <joint name="rx" type="hinge" axis="1 0 0" stiffness="3" damping="0.02"/>
-  <geom type="sphere" size="0.02" mass="0.1"/><site name="grip"/></body></worldbody></mujoco>
-"""
-"""A tool that springs hold. The default coupling pulls back with 1.3 N per mm, 1.3 N m per rad."""
-
-Pose = Callable[[int], tuple[float, float, float]]
-"""Place of a handle along x and y in m and its angle about x in rad, by tick."""
-
-
-def scripted(
-    folder: Path, pose: Pose, buttons: Callable[[int], int] = lambda _: 0, strength: float = 10.0
-) -> list[int]:
-    """Runs a handle that moves as told on a tool that springs hold, for 2.6 s.
-
-    Returns the tick of each probe, and after them the flag of the watch.
-    """
-
-    def whole(tick: int) -> tuple[float, ...]:
-        x, y, angle = pose(tick)
-        return (x, y, 0.0, np.cos(angle / 2), np.sin(angle / 2), 0.0, 0.0)
-
-    scene = folder / "sprung.xml"
-    scene.write_text(SPRUNG)
-    device = ScriptedDevice(whole, buttons=buttons, strength=strength)
-    with hb.Bridge(scene, device, clock=hb.SimulatedClock(), clutch=0) as bridge:
-        bridge.run(2.6)
-        flags = bridge.latest_records(2600)["flags"]
-    is_probed = flags & int(TickFlag.PROBED) != 0
-    begins = 1 + np.flatnonzero(np.diff(is_probed.astype(int)) == 1)
-    return [*begins.tolist(), int(np.bitwise_or.reduce(flags)) & ALARM]
-
-
-def ramped(tick: int, begin: int, value: float) -> float:
-    """Returns a value to which a handle goes smoothly within 100 ticks."""
-    return 0.5 * value * (1.0 - math.cos(math.pi * min(max(tick - begin, 0) / 100, 1.0)))
-
-
-def test_a_handle_that_stands_without_force_is_not_probed(tmp_path: Path) -> None:
-    """A clamp holds it; a clutch takes the force away after 0.4 s."""
-
-    def pose(tick: int) -> tuple[float, float, float]:
-        return ramped(tick, 0, 0.004), 0.0, 0.0
-
-    assert scripted(tmp_path, pose, lambda tick: int(tick > 500)) == [0]
-    assert scripted(tmp_path, pose)[-1] == TickFlag.UNANSWERED
-
-
-@pytest.mark.parametrize(("strength", "found"), [(10.0, TickFlag.UNANSWERED), (40.0, 0)])
-def test_a_strong_device_may_have_more_friction(
-    tmp_path: Path, strength: float, found: int
-) -> None:
-    """It stands under 4 N and 0.2 N m, which are a tenth of its limits, or most of them."""
-    still = scripted(tmp_path, lambda tick: (ramped(tick, 0, 0.003), 0.0, 0.2), strength=strength)
-    assert still[-1] == found
-    assert (len(still) > 1) == (found != 0)
-
-
-def test_each_axis_is_acquitted_for_itself(tmp_path: Path) -> None:
-    """The handle answers along x, and stands still along y."""
-
-    def pose(tick: int) -> tuple[float, float, float]:
-        x = ramped(tick, 0, 0.004) + ramped(tick, 1150, 1e-3) - ramped(tick, 1250, 5e-3)
-        return x, ramped(tick, 1250, 0.004), 0.0
-
-    first, second, flags = scripted(tmp_path, pose)
-    assert 1090 <= first <= 1110
-    assert 2340 <= second <= 2360
-    assert flags == TickFlag.UNANSWERED
-
-
-def test_an_angle_is_judged_by_a_whole_probe_of_its_own(tmp_path: Path) -> None:
-    """It has stood for 1 s at the end of the probe that translation answers."""
-
-    def pose(tick: int) -> tuple[float, float, float]:
-        angle = ramped(tick, 130, 0.3) + ramped(tick, 1810, 0.1)
-        return ramped(tick, 0, 0.004) + ramped(tick, 1150, 1e-3), 0.0, angle
-
-    first, second, flags = scripted(tmp_path, pose)
-    assert 1090 <= first <= 1110
-    assert 1730 <= second <= 1770
-    assert flags == 0
-
-
-def test_a_hand_that_friction_holds_at_a_wall_is_acquitted_once() -> None:
-    """It stands still, and moves against the force when that is lowered."""
-    path = Motion([0.0, 0.5, 4.0], [(x, 0.0, 0.0) for x in (0.0, 0.05, 0.05)])
-    device = SimulatedDevice(path=path, hand=DEFAULT_HAND, friction=0.5)
-    with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock()) as bridge:
-        summary = bridge.run(4.0)
-        flags = bridge.latest_records(4000)["flags"]
-    is_probed = flags & int(TickFlag.PROBED) != 0
-    assert np.count_nonzero(np.diff(is_probed.astype(int)) == 1) == 1
-    assert summary.is_certified
-    assert not summary.timekeeping.alarm
 
 
 @pytest.mark.parametrize("limit", [2.0, 10.0])

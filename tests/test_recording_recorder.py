@@ -223,17 +223,6 @@ def test_run_state_goes_on_to_say_why_the_force_is_lower() -> None:
     assert str(state).endswith("FORCE LOWERED: the device answers late, or an axis is reversed")
 
 
-def test_run_state_says_that_a_handle_stands_only_while_its_force_is_lower() -> None:
-    state, rows = RunState(), numbered(0, 3)
-    rows["flags"] = 0
-    rows["flags"][1] = TickFlag.UNANSWERED | TickFlag.PROBED
-    rows["flags"][2] = TickFlag.UNANSWERED  # it has left its stop, and the force is back
-    state.add(rows[:2])
-    assert str(state).endswith("FORCE LOWERED: the device does not move; move it off its stop")
-    state.add(rows[2:])
-    assert "FORCE" not in str(state)
-
-
 def test_run_state_names_the_forces_of_every_hand_and_counts_a_tick_once() -> None:
     state = RunState((True, False))
     rows = np.repeat(numbered(0, 4), 2)  # a record per hand and tick

@@ -31,7 +31,7 @@ from hapticbridge.whatif.recorded import RecordedRun, changed_request
 
 OPTION_CLASSES = BridgeOptions, Workspace, Limits, hb.Coupling, Grasp, GripAxis
 
-NOT_REPEATED = {"live", "realtime"}
+NOT_REPEATED = {"live", "probe", "realtime"}
 """Options that a repetition turns off: it is shown nowhere, and its time is not real."""
 
 NOT_RECORDED = {("Grasp", "device")}
@@ -134,7 +134,7 @@ RUNS: dict[str, Callable[[Path], Bridge]] = {
     "a slower scene": one_hand(scene_rate=250.0),
     "absolute poses": one_hand(workspace=Workspace(absolute=True)),
     "a massless tool": one_hand(method="direct", contact_stiffness=300.0),
-    "a real device": one_hand(clock=RealTime, sheet=REAL, live=True, realtime=True),
+    "a real device": one_hand(clock=RealTime, sheet=REAL, live=True, realtime=True, probe=False),
     "a grip axis": two_hands,
 }
 

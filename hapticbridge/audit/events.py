@@ -14,10 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.arguments import is_number, shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import conditions_of
 from hapticbridge.demand.loop_setting import LoopSetting, delay_ticks
 from hapticbridge.demand.methods import Method, RunCoupling
+from hapticbridge.demand.probe import EVENT as PROBE_EVENT
+from hapticbridge.demand.probe import MAX_DELAY
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.parameters import RunParameters
@@ -42,6 +45,7 @@ class RunEvents:
         resumed: Ticks at which the run resumed after a pause without force.
         resets: Ticks before which the scene was reset.
         couplings: Couplings of the law (K and B') in order, the initial one first.
+        added_delay: Delay in s that the probe found beyond the stated one.
     """
 
     parameters: RunParameters
@@ -50,6 +54,7 @@ class RunEvents:
     resumed: Array
     resets: Array
     couplings: tuple[Coupling, ...]
+    added_delay: float
     _began: Array
     _switched: tuple[Array, NDArray[np.int64]]
 
@@ -61,7 +66,7 @@ class RunEvents:
             RecordingError: An event is damaged, or the metadata lack the tool's start.
         """
         by_name: dict[str, list[Mapping[str, Any]]] = {
-            name: [] for name in ("resume", "reset", "coupling", "switch")
+            name: [] for name in ("resume", "reset", "coupling", "switch", PROBE_EVENT)
         }
         for event in recording.events:
             if event.get("event") in by_name and concerns(event, parameters):
@@ -80,6 +85,7 @@ class RunEvents:
                 parameters.coupling,
                 *(coupling_in(event, parameters) for event in by_name["coupling"]),
             ),
+            added_delay=max(map(_added_delay, by_name[PROBE_EVENT]), default=0.0),
             _began=ticks["coupling"],
             _switched=(
                 ticks["switch"],
@@ -201,6 +207,15 @@ def _tick(event: Mapping[str, Any]) -> int:
             f"event '{event.get('event')}' has tick {tick!r}; it must be a whole number >= 0"
         )
     return tick
+
+
+def _added_delay(event: Mapping[str, Any]) -> float:
+    delay = event.get("added_delay")
+    if not is_number(delay) or not 0.0 <= float(delay) <= MAX_DELAY:
+        raise RecordingError(
+            f"event '{PROBE_EVENT}' has added_delay {shown(delay)}; it must be 0 to {MAX_DELAY} s"
+        )
+    return float(delay)
 
 
 def _gains(coupling: Coupling) -> tuple[float, ...]:

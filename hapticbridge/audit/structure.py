@@ -241,7 +241,6 @@ def _flag_faults(
         (TickFlag.SWINGING, none, every & math.isfinite(guarding.swing_energy)),
         (TickFlag.RUNS_AWAY, none, every & math.isfinite(guarding.runaway_speed)),
         (TickFlag.PROBED, none, every & math.isfinite(guarding.runaway_speed)),
-        (TickFlag.UNANSWERED, none, every & math.isfinite(guarding.runaway_speed)),
     ):
         has = has_flag(ticks, flag)
         name = (flag.name or "").lower()

@@ -550,7 +550,7 @@ class JudgedDevice:
             fresh=fresh_share(run.info, run.parameters.period, timing.fresh, timing.due),
             new_samples=timing.fresh,
             due=timing.due,
-            mean_delay=timing.delays / max(timing.ticks, 1),
+            mean_delay=timing.delays / max(timing.ticks, 1) + run.events.added_delay,
             mean_jitter=timing.jitter / max(timing.ticks, 1),
             delay_energy=timing.max_uncovered,
             is_realtime=any(event.get("event") == "real_time" for event in recording.events),

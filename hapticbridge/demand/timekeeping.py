@@ -34,7 +34,6 @@ from hapticbridge.demand.certificate import DampingCondition
 from hapticbridge.kernel.hand_energy import INSTANT
 from hapticbridge.kernel.parameters import ROUNDING, RunParameters
 from hapticbridge.kernel.record import TickFlag
-from hapticbridge.kernel.swing_watch import PUSH, STAND
 from hapticbridge.theory.bounds import minimum_damping
 from hapticbridge.theory.transfer import MAX_DELAY, CouplingGrid
 from hapticbridge.units import format_si
@@ -122,7 +121,6 @@ class Alarm(StrEnum):
 
     RUNS_AWAY = "runs away"
     SWINGS = "swings"
-    UNANSWERED = "unanswered"
 
     @staticmethod
     def of(flags: int) -> Alarm | None:
@@ -130,7 +128,6 @@ class Alarm(StrEnum):
         for flag, alarm in (
             (TickFlag.RUNS_AWAY, Alarm.RUNS_AWAY),
             (TickFlag.SWINGING, Alarm.SWINGS),
-            (TickFlag.UNANSWERED, Alarm.UNANSWERED),
         ):
             if flags & int(flag):
                 return alarm
@@ -139,8 +136,6 @@ class Alarm(StrEnum):
     @property
     def words(self) -> str:
         """Name of the finding in a clause."""
-        if self is Alarm.UNANSWERED:
-            return "it is not known whether its motors push the right way"
         return "its force came late, reversed or in steps"
 
     @property
@@ -152,17 +147,10 @@ class Alarm(StrEnum):
                 "axis is reversed or exchanged (check the axes and signs of the device) or the "
                 "force comes very late"
             )
-        if self is Alarm.SWINGS:
-            return (
-                "the force was lowered because the device swung: it answered late, or in coarse "
-                "steps, or an axis is reversed; check the signs of its axes, lower --stiffness, "
-                "and measure its delay and resolution ('hapticbridge identify')"
-            )
-        force, torque = (format_si(*pair) for pair in zip(PUSH, ("N", "N m"), strict=True))
         return (
-            f"the device was pushed with {force} ({torque}) or more for {format_si(STAND, 's')} "
-            "and stood, and did not come against the force when that was lowered: "
-            f"{self.words}; move the handle away from its stop and start again"
+            "the force was lowered because the device swung: it answered late, or in coarse "
+            "steps, or an axis is reversed; check the signs of its axes, lower --stiffness, "
+            "and measure its delay and resolution ('hapticbridge identify')"
         )
 
 

@@ -19,7 +19,7 @@ gap. The maker's gravity compensation is on unless ``gravity=0`` is set. It depe
 only, so it creates no energy.
 
 The driver has not been verified on hardware, nor has the sign of the gripper's force: if it is
-reversed, the watch takes the force away (``kernel.swing_watch``).
+reversed, the probe before a run refuses it (``demand.probe``).
 """
 
 from __future__ import annotations

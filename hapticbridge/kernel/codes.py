@@ -236,7 +236,6 @@ LOSSLESS_TICK = int(TickFlag.MIDPOINT)
 SWINGING = int(TickFlag.SWINGING)
 RUNS_AWAY = int(TickFlag.RUNS_AWAY)
 PROBED = int(TickFlag.PROBED)
-UNANSWERED = int(TickFlag.UNANSWERED)
 """Bits of ``TickFlag`` as integers, because numba cannot compile an ``IntFlag``."""
 
 FORCE_OFF, CLUTCHED = 1 << 40, 1 << 41

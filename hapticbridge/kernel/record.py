@@ -36,8 +36,6 @@ class TickFlag(IntFlag):
         RUNS_AWAY: The device did not move as its force pushed, as with a reversed axis; the force
             was taken away before this tick.
         PROBED: The force is lowered for a moment to see whether the device follows it, or returns.
-        UNANSWERED: The device stood against its force and did not come against it when that was
-            lowered, so it is not known whether its motors push the right way.
     """
 
     OVERRUN = 1
@@ -54,7 +52,6 @@ class TickFlag(IntFlag):
     SWINGING = 4096
     RUNS_AWAY = 8192
     PROBED = 16384
-    UNANSWERED = 32768
 
 
 TICK_DTYPE = np.dtype(

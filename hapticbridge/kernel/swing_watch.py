@@ -1,69 +1,40 @@
-"""Watch for a device whose force comes late or in a wrong direction, which no energy account sees.
+"""Watch for a device whose force comes later than stated, or in a wrong direction in mid-run.
 
-A hand has no will above some 10 Hz, so fast motion is the answer to the force. With W and V the
-wrench sent (N, N m) and the velocity read (m/s, rad/s) above 20 Hz, A = V', and sums Σ over 0.1 s
+A hand has no will above some 10 Hz, so fast motion answers the force. With W and V the wrench sent
+(N, N m) and the velocity read (m/s, rad/s) above 20 Hz, in blocks of t = 4 ms, A = V', and sums Σ
+over 0.1 s, without unit
 
     p = Σ W·V/√(Σ W² Σ V²),   c = Σ W·A/√(Σ W² Σ A²),   x = ‖Σ W×A‖/√(Σ W² Σ A²)
 
-A passive hand cannot give fast power: p >= 0, and c > 0 where its inertia rules. A force that is
-late by τ shifts the answer by ωτ: p = −sin ωτ, c = cos ωτ. A reversed axis gives c = −1, axes
-exchanged x = 1. The answer to the wrench that was sent s earlier, for six s of 8 to 48 ms, is
+A passive hand has p >= 0, and c > 0 where its inertia rules. A force late by τ gives p = −sin ωτ
+and c = cos ωτ, a reversed axis c = −1, exchanged axes x = 1. c_s is c for the wrench sent s
+earlier, for six s of 8 to 48 ms; a motor that holds is answered so. With b the damping of the
+device, δp the motion in a block and w above 4 Hz, over 0.3 s, late work in J and least delay in s
 
-    c_s = Σ W_{k−s}·A_k/√(Σ W²_{k−s} Σ A_k²)
+    E_s = Σ (w_{k−s}·δp_k − b ‖δp_k‖²/t),    τ_0 = (b Σ V² − Σ W·V)/Σ W·A    where c >= 0.6
 
-A motor that holds is answered late. A rattling tool and coarse steps of an encoder move regardless
-of any wrench, so all c_s are near 0. A block of t = 4 ms gives one W and V; if samples come in
-bunches, it lasts until the next new one and counts with its mean speed. Slow forces are judged by
-the work of a force that is s late, above 4 Hz, over 0.3 s, with b the device's damping and δp the
-motion in a block:
+E_s is the largest for 4, 10, 20 and 40 ms, 0 where that of s = 0 without b is over E_s/4. Of a
+device that states a delay τ_d, Σ W·V + τ_d Σ W·A stands for Σ W·V where c > 0.
 
-    E_s = Σ (w_{k−s}·δp_k − b ‖δp_k‖²/t),    E_0 = Σ w_k·δp_k
+Findings, for translation and rotation each; E is 8 mJ at 10 N or 0.5 N m, in proportion to the
+limit. For 12 ms unless said otherwise; W and A must be known (``KNOWN_WRENCH``).
+    wrong way: c <= −0.6 with p <= 0.2, or x >= 0.6 with c and p < 0.6, or x >= 0.55 with E_s >= E.
+    The force is taken away.
+    late: p <= −0.4 with E_s >= E/4, or p <= −0.3 with E_s >= E; τ_0 >= 1.3 ms, 2.4 ms without a
+    stated delay, with E_s >= E for 40 ms; c <= 0 and p < 0.6 with c_s >= 0.4; after one of these
+    each E_s >= E. The greatest ratio r of the lever between device and handle is halved.
+    slammed: with w, v of every tick above 25 Hz, b Σ v² − Σ w·v over 0.3 s is 6.4 mW or more, and
+    Σ w_d·v >= 0.9 b Σ v² for the force w_d of d = 1 or 2 ms beyond the stated delay, for 0.385 s
+    (``SLAM``). r is halved.
+    coarse: 3 steps of an encoder within 0.3 s, over which the coupling pulls with half the limit
+    after equal samples for 4 ms. r is halved.
 
-A passive hand takes from the force that acts at least what the damping burns, Σ W·V >= b Σ V². A
-force that acts τ later gives Σ W·V + τ Σ W·A. Where c >= 0.6, the delay is thus at least
+E_s >= 3 E, or a gain of 0.1 m/s (1.5 rad/s) within 30 ms against 60 % of the limit, is a suspicion:
+r falls to a quarter for 0.15 s. This step is no hand's will, and its answer shows delay and sign.
+The next one waits 0.5 s, then twice as long each time up to 8 s. It is no alarm.
 
-    τ_0 = (b Σ V² − Σ W·V)/Σ W·A
-
-Of a device that states a delay τ_d, Σ W·V + τ_d Σ W·A stands for Σ W·V in τ_0 and p where c > 0:
-a delay that is known, and for which the coupling was chosen, is no fault.
-
-Findings, for translation and rotation each; E is 8 mJ at a limit of 10 N or 0.5 N m, in proportion:
-    reversed or exchanged: c <= −0.6 with p <= 0.2, or x >= 0.6 with c and p < 0.6, or x >= 0.55
-    with E_s >= E, for 12 ms. The force is taken away.
-    late: p <= −0.4 with E_s >= E/4, or p <= −0.3 with E_s >= E, for 12 ms; or τ_0 >= 1.3 ms, 2.4
-    ms without a stated delay, with E_s >= E for 40 ms; or c <= 0 and p < 0.6 with c_s >= 0.4 for 12
-    ms. The greatest ratio r of the lever between device and handle is halved, hence the stiffness
-    quartered; again for each E_s >= E.
-    slammed: w and v are the ones of every tick above 25 Hz, sums are over 0.3 s, w_d is the force
-    of d earlier. b Σ v² − Σ w·v is 6.4 mW or more on average over 0.3 s, at a limit of 10 N or 0.5
-    N m, and 80 % of that average now, since a single blow is forgotten; and Σ w_d·v >= 0.9 b Σ v²
-    for a d of 1 or 2 ms, each for 0.385 s. r is halved. No hand swings so fast, and a force that
-    acts later explains the motion, so it did. d begins at a stated delay, whose w_d also replaces w
-    if it gives more work. Blows on a stop of the device lack energy, too, but no force explains
-    them. Of an unknown damping b = 0 counts.
-    coarse: 3 steps within 0.3 s. r is halved. A step is a new sample that follows equal ones of 4
-    ms and more, and over which the coupling pulls with half the limit, r K ‖δp‖ >= F/2.
-
-E_s is the largest one for 4, 10, 20 and 40 ms, 0 where the account sees E_0 > E_s/4.
-
-They count only if Σ W² is at least (1 % of the limit)² s and fast acceleration 0.5 % of all.
-
-A suspicion without a finding starts a probe: r falls to a quarter for 0.15 s within the fade, and
-comes back. This step is no hand's will, so the answer to it shows delay and sign. Suspicious is E_s
->= 3 E, or a gain of 0.1 m/s (1.5 rad/s) within 30 ms against 60 % of the limit, in proportion to
-the limit. A probe is no alarm. The next one waits 0.5 s, then twice as long each time up to 8 s;
-the findings above need no probe and wait for nothing.
-
-A handle on its mechanical stop cannot answer: a reversed motor presses it there and nothing swings.
-One that stands for 1 s against 1.5 N (0.075 N m) and 15 % of the limit is probed, too. It stands if
-all samples are equal but for one step of an encoder to and fro. If it then moves against the force,
-a hand pushed it, and the motor of the axis with the most force is right, for the rest of the run. A
-soft stop moves it along the force, by less than 2 mm. If it does not move against the force in the
-probe, r stays at the quarter until the handle is 2 mm away, and the flag ``UNANSWERED`` stays. On a
-soft stop the step of such a probe rings, so that c_s does not count until 0.3 s after it.
-
-A device with prescribed motion is not watched (``guard.guard_parameters_for``). The page ``faults``
-of the guide has the margins and the limits of the method.
+Directions are tested before the force (``demand.probe``). A device with prescribed motion is not
+watched. The page ``faults`` of the guide has the margins and the limits of the method.
 """
 
 from __future__ import annotations
@@ -78,7 +49,6 @@ from hapticbridge.kernel.codes import (
     RUNS_AWAY,
     STALE_SAMPLE,
     SWINGING,
-    UNANSWERED,
     Part,
     State,
 )
@@ -164,20 +134,6 @@ PROBE, PROBE_SHARE, REST, LONGEST_REST = 0.15, 0.25, 0.5, 8.0
 """Duration in s of a probe, its share of the ratio, and the first and longest rest after it in s.
 At a quarter of the ratio a swing has a sixteenth of the stiffness and ends."""
 
-STAND, AWAY = 1.0, 2e-3
-"""Time in s for which a handle stands until it is probed, and distance in m at which it has left; a
-soft stop gives way by less. The tremor of a hand, at 8 to 12 Hz, leaves a step of most encoders
-within 1 s. Friction may hide it, and the answer to the probe is larger. Angles are ``USUAL_ARM``
-times as many rad."""
-
-ROUNDING = 1e-6
-"""Share of an encoder's step within which two places are equal; no unit."""
-
-PUSH, PUSH_SHARE = (1.5, 0.075), 0.15
-"""Least force in N and torque in N m under which a handle that stands is suspicious, and least
-share of the limit. A probe takes three quarters of it away, more than twice the friction of a
-desktop device. A strong device, as a wheel of 2 N m, has more friction."""
-
 RING, SENT, SPREAD = 16, 64, 16
 """Blocks that are kept for late work, ticks of the force that are kept, and most ticks over which
 the motion of a sample is spread."""
@@ -197,9 +153,6 @@ WATCH_DTYPE = np.dtype(
         ("gain", "<f8", 2),
         ("probe_blocks", "<i8"),
         ("longest_rest", "<i8"),
-        ("stand_ticks", "<i8"),
-        ("ring_blocks", "<i8"),
-        ("push", "<f8", 2),
         ("flags", "<i8"),
         ("max_lever", "<f8"),
         ("cap", "<f8"),
@@ -246,32 +199,19 @@ WATCH_DTYPE = np.dtype(
         ("still", "<i8", 2),
         ("steps", "<f8", 2),
         ("counts", "<i8", 12),
-        ("stray", "<f8", 6),
-        ("step", "<f8", 6),
-        ("stood", "<i8", 2),
-        ("is_right", "<i8", 6),
-        ("is_held", "<i8", 2),
-        ("rings_end", "<i8", 2),
     ]
 )
 """Sub-record ``watch``, written by this module alone. ``block_ticks`` is 0 without a watch; pairs
-are translation and rotation.
+are translation and rotation. The fields up to ``longest_rest`` are thresholds and filters.
 
-The first sixteen are thresholds and filters: ``sections`` those of the high-pass, ``corner`` the
-slow filters' gain per block, ``kept`` what the three memories keep of a block, ``limits`` in N and
-N m, ``late_energy`` E in J. ``cap`` is the greatest ratio after all findings, ``max_lever`` the one
-allowed now, ``returns_to`` the ratio before a probe; ``probe_end`` and ``rest_end`` in blocks.
-``wrench`` and ``motion`` are sums over the block. ``wrench_square`` to ``across`` are the sums over
-W and A, ``whole_square`` that of all acceleration; ``believed`` and ``delayed`` are E_0 and E_s;
-``known_damping`` is b or 0, and ``missing_power`` the average of what a slam lacks;
-``sent`` is a ring of w by tick, ``swung_square`` Σ v² and ``sent_power`` the sums Σ w_d·v;
-``late_along`` are the sums over W_{k−s}·A, and ``past_means`` and ``past_squares`` rings of W and
-Σ W². ``still`` counts the equal samples before this one, and
-``steps`` the coarse steps of late; ``counts`` are blocks in a row of late, reversed, exchanged,
-answered late, τ_0 and slams. ``stray`` is the way from where the handle stands, ``step`` the one
-step that it may make, ``stood`` the ticks since; ``is_right`` is 1 for an axis once it moved as a
-motor that is right lets it, ``is_held`` while r waits for it to leave; c_s does not count before
-the block ``rings_end``."""
+``cap`` is the greatest ratio after all findings, ``max_lever`` the one allowed now, ``returns_to``
+the ratio before a probe; ``probe_end`` and ``rest_end`` are blocks. ``wrench`` and ``motion`` are
+sums over the block, ``wrench_square`` to ``across`` sums over W, V and A, ``whole_square`` that of
+all acceleration; ``believed`` and ``delayed`` are E_0 and E_s. ``sent`` is a ring of w by tick,
+``swung_square`` Σ v², ``sent_power`` Σ w_d·v and ``missing_power`` the average of what a slam
+lacks. ``late_along`` are sums over W_{k−s}·A, with rings of W and Σ W² in ``past_means`` and
+``past_squares``. ``still`` counts equal samples, ``steps`` coarse steps, and ``counts`` blocks in a
+row of late, reversed, exchanged, answered late, τ_0 and slams."""
 
 
 def bind_watch(watch: Part, parameters: RunParameters) -> None:
@@ -299,11 +239,9 @@ def bind_watch(watch: Part, parameters: RunParameters) -> None:
     watch["late_energy"] = [limits.swing_energy * part for part in level]
     speed = limits.runaway_speed
     watch["gain"] = speed * level[0], USUAL_ARM * speed * level[1]
-    watch["probe_blocks"], watch["rest"], watch["longest_rest"], watch["ring_blocks"] = (
-        max(round(time / block), 1) for time in (PROBE, REST, LONGEST_REST, WORK_MEMORY)
+    watch["probe_blocks"], watch["rest"], watch["longest_rest"] = (
+        max(round(time / block), 1) for time in (PROBE, REST, LONGEST_REST)
     )
-    watch["stand_ticks"] = round(STAND / period)
-    watch["push"] = np.maximum(PUSH, PUSH_SHARE * watch["limits"])
     watch["known_damping"] = (
         parameters.device_damping or 0.0,
         parameters.device_rotational_damping or 0.0,
@@ -409,8 +347,6 @@ def _close_block(s: State) -> None:
         _add_block(s, kind)
         _add_late_answers(watch, kind)
         verdict |= _verdict(s, kind)
-        if _stands(s, kind):
-            verdict |= PROBED
     for i in range(6):
         watch.wrench[i] = watch.motion[i] = 0.0
     watch.blocks += 1
@@ -430,75 +366,13 @@ def _close_block(s: State) -> None:
         watch.rest_end = watch.probe_end + watch.rest
         watch.rest = min(2 * watch.rest, watch.longest_rest)
         watch.returns_to = s.guard.lever
-    is_probing = watch.blocks < watch.probe_end or watch.is_held[0] + watch.is_held[1] > 0
+    is_probing = watch.blocks < watch.probe_end
     watch.max_lever = PROBE_SHARE * watch.cap if is_probing else watch.cap
     watch.flags &= ~PROBED
     if is_probing or s.guard.lever < watch.returns_to:
         watch.flags |= PROBED
     else:
         watch.returns_to = 0.0
-
-
-@compiled
-def _stands(s: State, kind: int) -> bool:
-    """Returns True if the handle stands against the force; judges its answer to a probe."""
-    watch, first = s.watch, 3 * kind
-    square, axis = 0.0, first
-    for i in range(first, first + 3):
-        watch.stray[i] += watch.motion[i]
-        square += watch.wrench[i] * watch.wrench[i]
-        if abs(watch.wrench[i]) > abs(watch.wrench[axis]):
-            axis = i
-    is_judged = watch.blocks < watch.probe_end and watch.stood[kind] >= watch.stand_ticks
-    is_pushed = is_judged or math.sqrt(square) >= watch.push[kind] * watch.ticks
-    if is_judged:
-        watch.rings_end[kind] = watch.probe_end + watch.ring_blocks
-    if _has_left(watch, kind, axis, is_judged) or not (is_pushed or watch.is_held[kind]):
-        watch.is_held[kind] = watch.stood[kind] = 0
-        for i in range(first, first + 3):
-            watch.stray[i] = watch.step[i] = 0.0
-    elif is_pushed:
-        watch.stood[kind] += watch.ticks
-    is_known = watch.is_right[axis] or watch.is_held[kind] or s.loop.external_flags & STALE_SAMPLE
-    if watch.stood[kind] < watch.stand_ticks or is_known:
-        return False
-    until = watch.stand_ticks + watch.probe_blocks * watch.block_ticks
-    if watch.blocks == watch.probe_end - 1 and watch.stood[kind] >= until:
-        watch.is_held[kind] = 1
-        watch.flags |= UNANSWERED
-    return True
-
-
-@compiled
-def _has_left(watch: Part, kind: int, axis: int, is_judged: bool) -> bool:
-    """Returns True if the handle no longer stands; notes the first step of its encoder.
-
-    Args:
-        watch: The watch.
-        kind: 0 for translation, 1 for rotation.
-        axis: Index of the largest part of the wrench; its motor is right if that is the answer.
-        is_judged: True while the handle answers to a probe.
-    """
-    first, along = 3 * kind, 0.0
-    for i in range(first, first + 3):
-        along += watch.stray[i] * watch.wrench[i]
-    x, y, z = watch.stray[first], watch.stray[first + 1], watch.stray[first + 2]
-    u, v, w = watch.step[first], watch.step[first + 1], watch.step[first + 2]
-    way, step = norm((x, y, z)), norm((u, v, w))
-    is_away = way > AWAY * (1.0 if kind == 0 else USUAL_ARM)
-    if watch.is_held[kind]:
-        return is_away
-    if min(way, norm((x - u, y - v, z - w))) <= ROUNDING * step:
-        return False
-    if is_judged:
-        if along < 0.0:
-            watch.is_right[axis] = 1
-        return is_away or along < 0.0
-    if step > 0.0 or watch.stood[kind] == 0:
-        return True
-    for i in range(first, first + 3):
-        watch.step[i] = watch.stray[i]
-    return False
 
 
 @compiled
@@ -675,7 +549,6 @@ def _verdict(s: State, kind: int) -> int:
     counts[at + 2] = counts[at + 2] + 1 if is_exchanged else 0
     is_answered = along <= 0.0 and power < FOLLOWED
     is_answered = is_answered and _late_answer(watch, kind, least) >= ANSWERED
-    is_answered = is_answered and watch.blocks >= watch.rings_end[kind]
     counts[at + 3] = counts[at + 3] + 1 if is_answered else 0
     is_slammed = _is_slammed(watch, kind)
     if counts[at + 1] >= BLOCKS or counts[at + 2] >= BLOCKS:

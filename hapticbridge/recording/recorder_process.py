@@ -54,9 +54,6 @@ LOWERED = {
 }
 """Words on a force that the watch lowered, by its flag; the first that was seen is shown."""
 
-UNANSWERED = "FORCE LOWERED: the device does not move; move it off its stop"
-"""Words that are shown while the force is lowered for this."""
-
 
 class RunState:
     """State of a run for the status line, collected from records.
@@ -117,9 +114,7 @@ class RunState:
             f"{self._overruns} overruns",
         ]
         lowered = [words for flag, words in LOWERED.items() if self._flags & flag]
-        is_low = (self._last["flags"] & TickFlag.PROBED) != 0
-        is_held = is_low & (self._last["flags"] & TickFlag.UNANSWERED != 0)
-        parts += (lowered or ([UNANSWERED] if is_held.any() else []))[:1]
+        parts += lowered[:1]
         if self._silence >= SILENCE:
             parts.append(f"NO NEW SAMPLE for {self._silence:.1f} s")
         elif self._longest_silence >= SILENCE:

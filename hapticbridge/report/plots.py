@@ -347,7 +347,6 @@ FLAGS = (
     (TickFlag.SWINGING, "lowered: it swings"),
     (TickFlag.RUNS_AWAY, "taken away: wrong way"),
     (TickFlag.PROBED, "probed: late or not"),
-    (TickFlag.UNANSWERED, "motor not known"),
 )
 """Flags shown over time, and their labels."""
 

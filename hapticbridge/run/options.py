@@ -170,6 +170,10 @@ class BridgeOptions:
         dead_man: Button of the device, from 0, that must be held for any force.
         mark: Button of the device, from 0. Each press writes an event 'mark' into the recording;
             'hapticbridge export --from S --to S' cuts a recording.
+        probe: Push a device with small forces along each axis, for about a second before the run,
+            and refuse it if it moves another way: a reversed axis pulls the hand into walls. The
+            delay that is found counts if it is longer than the stated one. By default done for a
+            real device.
         tool_weight: Weight of the tool in the hand, unless the device cannot hold it. With
             --no-tool-weight, or False, the bridge carries it.
         realtime: Request real-time priority and locked memory for the loop, and print what the
@@ -197,6 +201,7 @@ class BridgeOptions:
     clutch: int | None = _button()
     dead_man: int | None = _button()
     mark: int | None = _button()
+    probe: bool | None = None
     tool_weight: bool = True
     realtime: bool | None = None
     pipelined: bool | None = None
@@ -411,6 +416,7 @@ class RunSetup(StepTimes):
         guard: Guard parameters.
         contact_stiffness: K_c in N/m for a massless tool, else 0.
         mark: Bit of the mark button; 0 without one.
+        is_probed: True if the device is probed before the run.
         tool_weight: False to carry the tool's weight.
         is_realtime: True if real time is requested from the system.
         is_pipelined: True if a tick computes ahead for the next one.
@@ -428,6 +434,7 @@ class RunSetup(StepTimes):
     guard: GuardParameters = UNGUARDED
     contact_stiffness: float = 0.0
     mark: int = 0
+    is_probed: bool = False
     tool_weight: bool = True
     is_realtime: bool = False
     is_pipelined: bool = False
@@ -487,6 +494,8 @@ class RunSetup(StepTimes):
                 method, requested, options.contact_stiffness
             ),
             mark=button_mask(options.mark),
+            is_probed=not info.is_prescribed
+            and (info.is_real if options.probe is None else options.probe),
             tool_weight=options.tool_weight,
             is_realtime=wants_real_time(options.realtime, clock, is_real=info.is_real),
             is_pipelined=is_real_clock if options.pipelined is None else options.pipelined,

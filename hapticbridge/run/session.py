@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.clock import Clock, RealClock, slept_ns
+from hapticbridge.clock import Clock, RealClock, SimulatedClock, slept_ns
 from hapticbridge.coupling import Coupling
 from hapticbridge.dataclass_json import to_json
 from hapticbridge.demand.guard import (
@@ -27,9 +27,11 @@ from hapticbridge.demand.guard import (
     wait_until_still,
 )
 from hapticbridge.demand.methods import prepare, prepare_hands
+from hapticbridge.demand.probe import EVENT as PROBE_EVENT
+from hapticbridge.demand.probe import Probed, ProbedHand, probe_devices
 from hapticbridge.demand.trip import BY_TRIP, Trip, TripCode
 from hapticbridge.device import Device
-from hapticbridge.device.base import checked_close, checked_start, checked_write
+from hapticbridge.device.base import checked_close, checked_read, checked_start, checked_write
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.kernel.codes import OK, RING_FULL
 from hapticbridge.kernel.jit import direct
@@ -128,6 +130,28 @@ class MarkButton:
         if is_held and not self._was_held:
             self._note()
         self._was_held = is_held
+
+
+class ProbedPort:
+    """Device as the probe reads and writes it: flags and a wrench per hand.
+
+    Args:
+        device: The device, or those of several hands.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self._device, self._read, self._write = device, checked_read(device), checked_write(device)
+
+    def read(self, sample: NDArray[np.void]) -> Sequence[int]:
+        """Reads the newest samples; returns the flags of each."""
+        flags = self._read(sample)
+        if isinstance(self._device, DeviceGroup):
+            return list(self._device.external_flags)
+        return [flags]
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        """Commands a wrench per hand, (n, 6)."""
+        self._write(wrench if isinstance(self._device, DeviceGroup) else wrench[0])
 
 
 class TickKernel:
@@ -234,6 +258,7 @@ class Session:
         end: Tick before which the run ends; −1 for none.
         signal: Name of the signal that ended the last run; empty if none did.
         last_trip: Trip that ended the last run; None without one.
+        probed: Result of the probe of each hand's device; None of one that was not to be probed.
         is_open: False after ``close``.
 
     Raises:
@@ -258,6 +283,7 @@ class Session:
         self._start_potential = 0.0
         self.stopped_by = self.signal = ""
         self.last_trip: Trip | None = None
+        self.probed: list[Probed | None] = [None] * len(self._setups)
         self._before_trip = np.empty(0, TICK_DTYPE)
         self._grants: tuple[Grant, ...] = ()
         self._is_begun = self._is_held = self._has_warned = False
@@ -496,12 +522,13 @@ class Session:
         self.event("real_time", **answers)
 
     def start_clock(self) -> None:
-        """Waits until the real devices are still, then starts the time of the run.
+        """Waits until the real devices are still, probes them, and starts the time of the run.
 
         A simulated hand beside them is not read meanwhile: its motion begins with the run.
 
         Raises:
-            DeviceError: The device keeps moving, or a hand moved one with absolute poses too far.
+            DeviceError: The device keeps moving, a hand moved one with absolute poses too far, or
+                an axis is reversed or exchanged.
         """
         setup, waiting, sample = self.setup, self.stop.waiting, self.kernel.sample
         device, hands = self.device, list(range(sample.size))
@@ -509,11 +536,35 @@ class Session:
             device, hands = device.real_ones()
         newest = sample[hands]
         wait_until_still(device, newest, setup.period, self.clock, lambda: waiting)
+        if not self.tick and not waiting and any(self._setups[i].is_probed for i in hands):
+            self._probe(device, hands, newest)
         sample[hands] = newest
         if not self.tick and not waiting:
             self._refuse_stretched_start()
         self.clock.start(round(setup.period * 1e9))
         self._slept = slept_ns()
+
+    def _probe(self, device: Device, hands: Sequence[int], sample: NDArray[np.void]) -> None:
+        """Probes the devices of some hands, and records the findings; ``sample`` is theirs."""
+        clock = RealClock() if type(self.clock) is RealClock else SimulatedClock()
+        clock.start(round(self.setup.period * 1e9))
+        setups, waiting = [self._setups[i] for i in hands], self.stop.waiting
+        probed_hands = [
+            ProbedHand(
+                each.info,
+                each.limits,
+                each.period,
+                has_dead_man=each.guard.dead_man != 0,
+            )
+            for each in setups
+        ]
+        found = probe_devices(ProbedPort(device), sample, probed_hands, clock, lambda: waiting)
+        for i, each, probed in zip(hands, setups, found, strict=True):
+            self.probed[i] = probed
+            grip = {"grip": each.scene.grip} if len(self._setups) > 1 else {}
+            self.event(PROBE_EVENT, **grip, **probed.details(each.info, each.period))
+        for each, probed in zip(setups, found, strict=True):
+            probed.refuse_wrong_axes(each.info)
 
     def take_changes(self) -> None:
         """Applies waiting inputs and one command before a tick, and records them."""
@@ -640,7 +691,7 @@ class Session:
                 setup.info,
                 setup.method,
                 setup.coupling,
-                outcome,
+                replace(outcome, probed=self.probed[hand]),
             )
             for hand, setup in enumerate(self._setups)
         ]

@@ -23,6 +23,7 @@ from hapticbridge.demand.certification import (
 )
 from hapticbridge.demand.loop_setting import fresh_share
 from hapticbridge.demand.methods import Method, RunCoupling, default_method, method_named
+from hapticbridge.demand.probe import Probed
 from hapticbridge.demand.timekeeping import RunTimes, Timekeeping
 from hapticbridge.demand.trip import Trip
 from hapticbridge.device import DeviceInfo
@@ -154,6 +155,7 @@ class RunOutcome:
         is_realtime: True if real time was requested from the system.
         start_potential: Potential energy in J before the first tick.
         trip: Stop by the guard; None without one.
+        probed: Result of the probe of the hand's device; None without one.
     """
 
     ticks: int
@@ -165,6 +167,11 @@ class RunOutcome:
     is_realtime: bool
     start_potential: float
     trip: Trip | None = None
+    probed: Probed | None = None
+
+    def added_delay(self, info: DeviceInfo, period: float) -> float:
+        """Returns the delay in s that the probe found beyond the stated one."""
+        return self.probed.added_delay(info, period) if self.probed else 0.0
 
 
 WELD = "the weld in its stiffest directions at the start"
@@ -174,6 +181,7 @@ _NAME_WIDTH = 20
 """Characters of a row's name in the text of a summary, with the space after it."""
 
 _OF_A_HAND = (
+    "probe",
     "silence",
     "peak",
     "reach",
@@ -228,6 +236,7 @@ class Summary:
         grip: Name of the grip that the hand holds.
         device: Name of the device.
         trip: Stop by the guard; None without one.
+        probe: Result of the probe of the device before the run, as a clause; empty without one.
         hands: Summary of each hand by itself, if several hold the scene. Fault, share of the slack
             and certification of the whole are then those of all of them.
     """
@@ -260,6 +269,7 @@ class Summary:
     grip: str = ""
     device: str = ""
     trip: Trip | None = None
+    probe: str = ""
     hands: tuple[Summary, ...] = ()
 
     def at_record(self, record: np.void) -> Summary:
@@ -356,6 +366,8 @@ class Summary:
         yield "ran", f"{self.duration:.3f} s, {self.ticks} ticks ({self.stopped_by})"
         skipped = f" ({self.skipped} deadlines skipped)" if self.skipped else ""
         yield "overruns", f"{self.overruns}{skipped}, records dropped {self.dropped}"
+        if self.probe:
+            yield "probe", self.probe
         if remark := self.timekeeping.remark:
             yield "time kept", remark
         if silence := self.timekeeping.silence:
@@ -439,7 +451,8 @@ class Summary:
             fresh=fresh_share(info, parameters.period, new, due),
             new_samples=new,
             due=due,
-            mean_delay=float(timing["delays"]) / max(outcome.ticks, 1),
+            mean_delay=float(timing["delays"]) / max(outcome.ticks, 1)
+            + outcome.added_delay(info, parameters.period),
             mean_jitter=float(timing["jitter"]) / max(outcome.ticks, 1),
             delay_energy=float(timing["max_uncovered"]),
             is_realtime=outcome.is_realtime,
@@ -490,6 +503,7 @@ class Summary:
             has_hand=not info.is_prescribed,
             start_potential=outcome.start_potential,
             trip=outcome.trip,
+            probe=outcome.probed.words if outcome.probed else "",
             grip=parameters.grip,
             device=info.name,
         )

@@ -144,7 +144,7 @@ def changed_request(hands: Sequence[RecordedRun], settings: Sequence[Settings]) 
         request,
         parameters=settings[0].scene,
         grasps=tuple(grasps),
-        options=replace(options, realtime=False, live=False),
+        options=replace(options, realtime=False, probe=False, live=False),
     )
 
 

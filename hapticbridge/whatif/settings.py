@@ -21,6 +21,7 @@ KEPT = {
     "clutch": "its presses are recorded",
     "dead_man": "its presses are recorded",
     "mark": "its presses are recorded",
+    "probe": "no device is there to be probed",
     "tool_weight": "the recorded scene carries it or not",
     "i_know": "no hand is at the device",
     "realtime": "the time is not real",

@@ -52,10 +52,11 @@ class Fault:
     Attributes:
         name: In a few words.
         do: Does it to a rig.
-        ends: What must come of it: ``trip``, ``fades`` (the force is taken away and comes back),
-            ``slips`` (the handle slips for what late samples gave), ``stops`` (the run ends with
-            zero force), ``lowers`` (the watch lowers the force or takes it away), ``leaves`` (the
-            bridge ends and leaves the recorder to finish) or ``goes on``.
+        ends: What must come of it: ``trip``, ``refuses`` (the run ends before its first tick),
+            ``fades`` (the force is taken away and comes back), ``slips`` (the handle slips for
+            what late samples gave), ``stops`` (the run ends with zero force), ``lowers`` (the
+            watch lowers the force or takes it away), ``leaves`` (the bridge ends and leaves the
+            recorder to finish) or ``goes on``.
         says: What the audit of its recording must name; empty where the run is an ordinary one.
         without: What of the guard is switched off on the other side.
         cause: The tick at which it can be seen.
@@ -81,6 +82,7 @@ class Fault:
         """Returns the device after the same without its part of the guard, unrecorded."""
         rig = Rig(folder)
         self.do(rig)
+        rig.options |= {"probe": False}
         rig.guard |= self.without or {}
         return rig.run_unrecorded()
 
@@ -680,6 +682,26 @@ UNSEEN = (
 )
 """Faults that only the watch finds (``kernel.swing_watch``)."""
 
+
+def probed(name: str, change: Callable[[], Change], hand: Hand) -> Fault:
+    """Returns a fault of a device from its start on, which is probed before the run."""
+
+    def do(rig: Rig) -> None:
+        rig.is_probed = True
+        forced(change, hand)(rig)
+
+    return Fault(name, do, "refuses", "the run had no tick", UNWATCHED, cause=0, energy=0.01)
+
+
+PROBED = (
+    probed("reversed axis, probed", lambda: _reversed_x, DEFAULT_HAND),
+    probed("reversed axis, two fingers, probed", lambda: _reversed_x, FINGERS),
+    probed("exchanged axes, probed", lambda: _exchanged, DEFAULT_HAND),
+    probed("exchanged axes, two fingers, probed", lambda: _exchanged, FINGERS),
+    probed("reversed torque, probed", lambda: _reversed_torque, TWO_FINGERS_TURN),
+)
+"""Faults that the probe finds before the force (``demand.probe``)."""
+
 DISK_FULL = Fault("disk full", _full_tmpfs, "stops", "the disk is full", within=600)
 
 PUSHED = 566
@@ -716,10 +738,10 @@ FAULTS = (
     Fault("10 x too stiff, free", stiff(10, None), "slips", "", UNGUARDED),
     Fault("10 x too stiff, in a hand", stiff(10, DEFAULT_HAND), "slips"),
     Fault("edge of the workspace", _edge, "fades", within=150),
-    # the hand has no tremor: it stands within a step, is probed once, and the handle slips
-    Fault("encoder steps of 50 µm", _quantised, "slips"),
+    Fault("encoder steps of 50 µm", _quantised, "goes on"),
     Fault("encoder steps of 4 mm", corrupting(_coarse), "lowers", "coarse steps", within=300),
     *UNSEEN,
+    *PROBED,
     Fault("error in the user's code", acting(_raise), "stops", "ZeroDivisionError"),
     Fault("recorder killed", acting(_kill_recorder), "stops", "recorder died", within=101),
     Fault("recording may not grow", _fill_disk, "stops", "recorder died", within=600),

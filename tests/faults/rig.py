@@ -35,6 +35,9 @@ WATCHED = TickFlag.SWINGING | TickFlag.RUNS_AWAY
 FELT = 0.01
 """Energy in J given to the hand from which on a late force must be found."""
 
+PROBE = 3.0
+"""Time in s after which the hand of a probed device begins to move: more than a probe takes."""
+
 PRESS = ((0.0, 0.0), (0.2, 0.0), (0.9, 0.0804), (9.0, 0.0804))
 """Time in s and where the hand wants to be along x in m: the wall is at 10 mm, and 135 N/m over the
 rest of the way are 9 N."""
@@ -172,6 +175,7 @@ class Rig:
         coupling: None: the default.
         options: Of the bridge.
         duration: In s.
+        is_probed: Whether the device is probed before the run; the hand begins after that.
         guard: Changes to what the guard does, for the other side of a test.
         on_tick: Called before each tick with the bridge.
         after: Called once the bridge is left, before its recording is judged.
@@ -185,6 +189,7 @@ class Rig:
     coupling: Coupling | None = None
     options: dict[str, Any] = field(default_factory=dict)
     duration: float = 2.5
+    is_probed: bool = False
     guard: dict[str, Any] = field(default_factory=dict)
     on_tick: Callable[[Bridge, int], None] | None = None
     around: Callable[[ExitStack], None] | None = None
@@ -198,7 +203,10 @@ class Rig:
         if self._device is None:
             path = None
             if self.parameters.get("hand", 1) is not None:
-                path = motion_of(self.points, turns=self.turns)
+                points = self.points
+                if self.is_probed:
+                    points = (points[0], *((time + PROBE, place) for time, place in points))
+                path = motion_of(points, turns=self.turns)
             self._device = FaultyDevice(SimulatedDevice(path=path, **self.parameters))
         return self._device
 
@@ -223,7 +231,8 @@ class Rig:
         error, ticks_done = "", 0
         if self.around is not None:
             self.around(stack)
-        options = {"limits": Limits(force=10.0, torque=0.5, ramp=0.2)} | self.options
+        limits = Limits(force=10.0, torque=0.5, ramp=0.2)
+        options: dict[str, Any] = {"limits": limits, "probe": self.is_probed} | self.options
         try:
             bridge = Bridge(
                 self.scene,
@@ -238,7 +247,8 @@ class Rig:
             with bridge:
                 try:
                     act = self.on_tick or (lambda _bridge, _tick: None)
-                    bridge.run(self.duration, lambda tick: act(bridge, tick))
+                    duration = self.duration + PROBE * self.is_probed
+                    bridge.run(duration, lambda tick: act(bridge, tick))
                 finally:
                     ticks_done = bridge.session.tick
         except (HapticBridgeError, ZeroDivisionError) as raised:

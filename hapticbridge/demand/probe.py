@@ -1,0 +1,381 @@
+"""Probe of a device before its force: direction and delay of each motor.
+
+Along each axis in turn a small force F = ±A is sent, and the device is read. Hand and handle are
+passive, so that a motor that is right, and acts a time l after the write, moves them by
+
+    F(t − l) = m a + c v + k (x − x_0),    m, c, k >= 0
+
+with m in kg, c in N s/m, k in N/m, or their like in rotation. Integrated twice,
+
+    ∬F(t − l) = m x + c ∫x + k ∬x + c_0 + c_1 t + c_2 t²
+
+it is linear in m, c and k and needs no derivative of the samples; c_0 to c_2 hold what the hand did
+before. It is fitted with m, c, k >= 0 for each l up to ``MAX_DELAY``, for −F as for F, on each axis
+that moved. The misfit E is the share of (∬F)² that a fit leaves, without unit. A hypothesis (this
+axis with this sign, or a delay beyond the stated one) holds if its E is at most ``MISFIT`` and that
+of every other is ``RATIO`` times as large. A wrong direction must be found twice.
+
+The signs have neither mean nor trend, so that a mass stands afterwards where it was, and a hand
+that shakes does not move like this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.clock import Clock
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.loop_setting import delay_ticks, device_period
+from hapticbridge.device.base import AXES, USUAL_FORCE_LIMIT, USUAL_TORQUE_LIMIT, DeviceInfo
+from hapticbridge.errors import DeviceError
+from hapticbridge.kernel.parameters import ROUNDING
+from hapticbridge.kernel.pose import Quaternion, quaternion_of, rotation_between
+from hapticbridge.kernel.record import TickFlag
+from hapticbridge.units import format_si
+
+Array = NDArray[np.float64]
+
+SIGNS = tuple(1.0 if sign == "+" else -1.0 for sign in "+---++-+++--")
+"""Signs of the force, one after another."""
+
+LEAD, PULSE, MAX_DELAY = 0.01, 0.008, 0.05
+"""Times in s before the first force, of each sign, and after the last one; the third is also the
+longest delay that is seen. Longer pulses move the hand further, shorter ones too little."""
+
+SLOWEST = 0.004
+"""Longest time in s between two samples of a device that can be probed: four for each sign."""
+
+LEVELS = 0.03, 0.1
+"""A as shares of the force limit, or of the usual limit if that is more; without unit. The second
+is sent if the first tells nothing, because of friction, a coarse encoder or a firm hand."""
+
+FARTHEST = 4e-3, 0.06
+"""Way in m and angle in rad at which the force ends early. 0.3 N move 20 g by 4 mm."""
+
+TREMOR = 5e-4, 8e-3
+"""Way in m and angle in rad that a hand goes by itself. A wrong direction that is found in less of
+a motion is looked at with the larger force."""
+
+MISFIT, RATIO = 0.05, 5.0
+"""Largest E of a hypothesis that holds, and least ratio of the others' to it, without unit."""
+
+MOVED = 0.5
+"""Least motion of an axis that may be the one that was pushed, as a share of the largest one."""
+
+DELAY_STEP, LEAST_DELAY = 2.5e-4, 5e-4
+"""Step in s of the delays tried, and least excess in s over the stated one that is a finding."""
+
+EVENT = "probe"
+"""Event of a recording with what a probe has found of a hand's device."""
+
+
+class Direction(StrEnum):
+    """Direction in which a device moves under a force along one of its axes."""
+
+    RIGHT = "right"
+    REVERSED = "reversed"
+    EXCHANGED = "exchanged"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Answer of a device to a force along one axis.
+
+    Attributes:
+        axis: Name of the axis of the force.
+        direction: Direction of the motion.
+        moved: Name of the axis that moved; empty if it is unknown.
+        delay: Time in s from a write to its effect in a sample if it is beyond the stated one; else
+            0.
+    """
+
+    axis: str
+    direction: Direction = Direction.UNKNOWN
+    moved: str = ""
+    delay: float = 0.0
+
+    @property
+    def is_wrong(self) -> bool:
+        """True if the axis is reversed or exchanged."""
+        return self.direction in (Direction.REVERSED, Direction.EXCHANGED)
+
+
+@dataclass(frozen=True, slots=True)
+class Probed:
+    """Result of the probe of one hand's device.
+
+    Attributes:
+        answers: Answer of each axis.
+        skipped: Reason for which it was not probed, as a clause; empty if it was.
+    """
+
+    answers: tuple[Answer, ...] = ()
+    skipped: str = ""
+
+    @property
+    def delay(self) -> float:
+        """Largest delay in s beyond the stated one; 0 without one."""
+        return max((each.delay for each in self.answers), default=0.0)
+
+    def axes(self, direction: Direction) -> str:
+        """Names of the axes with a direction."""
+        return ", ".join(each.axis for each in self.answers if each.direction == direction)
+
+    def details(self, info: DeviceInfo, period: float) -> dict[str, object]:
+        """Returns the details of the event, with the period T of the loop in s."""
+        directions = {each.axis: each.direction.value for each in self.answers}
+        return {"axes": directions, "added_delay": self.added_delay(info, period)}
+
+    def added_delay(self, info: DeviceInfo, period: float) -> float:
+        """Returns by how much in s the delay is longer than the one that is judged anyway."""
+        return max(self.delay - (delay_ticks(info, period) or 0) * period, 0.0)
+
+    @property
+    def words(self) -> str:
+        """Findings in a line."""
+        if self.skipped:
+            return f"not probed: {self.skipped}"
+        right, unknown = self.axes(Direction.RIGHT), self.axes(Direction.UNKNOWN)
+        texts = [f"{right} answered the right way"] if right else []
+        texts += [f"{unknown} could not be probed, as if held firmly"] if unknown else []
+        if self.delay:
+            texts.append(f"the force acts {format_si(self.delay, 's')} after the sample")
+        return ", ".join(texts)
+
+    def refuse_wrong_axes(self, info: DeviceInfo) -> None:
+        """Refuses a device that did not move as it was pushed.
+
+        Raises:
+            DeviceError: The message names the axis and the remedy.
+        """
+        for each in self.answers:
+            if not each.is_wrong:
+                continue
+            way = "backwards" if each.direction == Direction.REVERSED else f"along {each.moved}"
+            raise DeviceError(
+                f"a small force along {each.axis} moved the device '{info.name}' {way}: its axis "
+                f"{each.axis} is {each.direction}; correct it by the device's option 'reverse', or "
+                "by the order and signs of its axes in the driver or firmware"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class ProbedHand:
+    """Device of a hand as the probe needs it.
+
+    Attributes:
+        info: Its data sheet.
+        limits: Limits of the run.
+        period: T of the loop in s.
+        has_dead_man: True if a button must be held for any force.
+    """
+
+    info: DeviceInfo
+    limits: Limits
+    period: float
+    has_dead_man: bool = False
+
+    @property
+    def obstacle(self) -> str:
+        """Reason for which it cannot be probed, as a clause; empty if it can."""
+        if self.has_dead_man:
+            return "its force needs a button"
+        own = device_period(self.info, self.period)
+        if own <= SLOWEST * (1.0 + ROUNDING):
+            return ""
+        return (
+            f"it gives a sample in {format_si(own, 's')}, and a probe needs one in "
+            f"{format_si(SLOWEST, 's')}"
+        )
+
+    @property
+    def hold(self) -> float:
+        """Time in s for which it may hold a force beyond a period of the loop."""
+        return device_period(self.info, self.period) - self.period
+
+    def force(self, axis: int, level: int) -> float:
+        """Returns A in N or N m, half of the limit at most; 0 if it has no such axis."""
+        if AXES[axis] not in self.info.axes or level < 0 or self.obstacle:
+            return 0.0
+        limit, usual = (
+            (self.limits.force, USUAL_FORCE_LIMIT)
+            if axis < 3
+            else (self.limits.torque, USUAL_TORQUE_LIMIT)
+        )
+        return min(LEVELS[level] * max(limit, usual), 0.5 * limit)
+
+
+class Port(Protocol):
+    """Devices of all hands."""
+
+    def read(self, sample: NDArray[np.void]) -> Sequence[int]:
+        """Reads the newest sample of each; returns the flags of each."""
+
+    def write(self, wrench: Array) -> None:
+        """Commands a wrench to each, (n, 6)."""
+
+
+@dataclass(slots=True)
+class Push:
+    """Force along one axis of a hand's device, and the motion that answered.
+
+    Attributes:
+        force: A in N or N m.
+        axis: Number of the axis.
+        times: Time of each sample in s.
+        places: Way in m, or angle in rad, along the three axes of its kind.
+        changes: Time of each change of the force in s, and the change in N or N m.
+        present: Force now in N or N m.
+        is_far: True once the device went too far.
+    """
+
+    force: float
+    axis: int
+    times: list[float] = field(default_factory=list)
+    places: list[Sequence[float]] = field(default_factory=list)
+    changes: list[tuple[float, float]] = field(default_factory=list)
+    present: float = 0.0
+    is_far: bool = False
+
+    def next_force(self, time: float) -> float:
+        """Returns the force at a time in s."""
+        number = int((time - LEAD) // PULSE)
+        is_far = self.places and max(map(abs, self.places[-1])) > FARTHEST[self.axis // 3]
+        self.is_far = self.is_far or bool(is_far)
+        is_on = 0 <= number < len(SIGNS) and not self.is_far
+        force = self.force * SIGNS[number] if is_on else 0.0
+        if force != self.present:
+            self.changes.append((time, force - self.present))
+            self.present = force
+        return force
+
+    @property
+    def way(self) -> float:
+        """Longest way in m, or angle in rad, from the start."""
+        return float(np.abs(self.places).max()) if self.places else 0.0
+
+    def answer(self, hand: ProbedHand) -> Answer:
+        """Judges the motion."""
+        first, unknown = self.axis - self.axis % 3, Answer(AXES[self.axis])
+        if len(self.times) < 4 * len(SIGNS) or not self.changes:
+            return unknown
+        times, places = np.array(self.times), np.array(self.places)
+        delays = np.arange(0.0, MAX_DELAY, DELAY_STEP)
+        at, change = np.array(self.changes).T
+        since = np.maximum(times[:, None, None] - at - delays[:, None], 0.0)
+        twice = 0.5 * since**2 @ change  # ∬F, a column for each delay
+        drift = np.linalg.qr(np.vander(times, 3))[0]
+        twice -= drift @ (drift.T @ twice)
+        sizes = np.linalg.norm(places - drift @ (drift.T @ places), axis=0)
+        misfits = {
+            (i, sign): _misfits(times, places[:, i], sign * twice, drift)
+            for i in range(3)
+            if sizes[i] >= MOVED * sizes.max() > 0.0
+            for sign in (1.0, -1.0)
+        }
+        ordered = sorted((each.min(), key) for key, each in misfits.items())
+        if not ordered or not _holds(ordered[0][0], ordered[1][0]):
+            return unknown
+        least, (i, sign) = ordered[0]
+        moved, each = AXES[first + i], misfits[i, sign]
+        if first + i != self.axis:
+            return Answer(AXES[self.axis], Direction.EXCHANGED, moved)
+        if sign < 0.0:
+            return Answer(AXES[self.axis], Direction.REVERSED, moved)
+        stated = hand.info.delay or 0.0
+        is_beyond = delays >= stated + hand.hold + LEAST_DELAY
+        rest = each[~is_beyond].min()
+        delay = float(delays[each.argmin()]) if is_beyond.any() and _holds(least, rest) else 0.0
+        return Answer(AXES[self.axis], Direction.RIGHT, moved, max(delay - hand.hold, 0.0))
+
+
+def _holds(misfit: float, other: float) -> bool:
+    return misfit <= MISFIT and other >= RATIO * misfit
+
+
+def _misfits(times: Array, place: Array, twice: Array, drift: Array) -> Array:
+    """Returns E for each column of ∬F, with x, its integrals and ∬F free of drift."""
+    from scipy.optimize import nnls  # noqa: PLC0415 - 0.2 s, and only a probe needs it
+
+    once = _integral(times, place)
+    columns = np.stack([place, once, _integral(times, once)], axis=1)
+    columns -= drift @ (drift.T @ columns)
+    columns /= np.linalg.norm(columns, axis=0)
+    basis, triangle = np.linalg.qr(columns)
+    parts, squares = basis.T @ twice, np.sum(twice * twice, axis=0)
+    left = [nnls(triangle, part)[1] ** 2 - part @ part for part in parts.T]
+    return np.asarray(np.maximum(1.0 + np.array(left) / squares, 0.0))
+
+
+def _integral(times: Array, values: Array) -> Array:
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(times)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def probe_devices(
+    port: Port,
+    sample: NDArray[np.void],
+    hands: Sequence[ProbedHand],
+    clock: Clock,
+    is_over: Callable[[], object] = lambda: False,
+) -> list[Probed]:
+    """Probes the devices of all hands together, up to the first wrong axis; ends with zero force.
+
+    Args:
+        port: The started devices.
+        sample: ``SAMPLE_DTYPE``, one per hand; receives the newest samples.
+        hands: Their data sheets and limits.
+        clock: A started clock, whose periods pace it.
+        is_over: Returns True if the run was stopped meanwhile; the probe then ends.
+    """
+    answers: list[list[Answer]] = [[] for _ in hands]
+    for axis in range(len(AXES)):
+        if is_over() or any(each.is_wrong for own in answers for each in own):
+            break
+        levels = {i: 0 for i, each in enumerate(hands) if each.force(axis, 0) > 0.0}
+        doubted: dict[int, Answer] = {}
+        while levels:
+            pushes = [
+                Push(hand.force(axis, levels.get(i, -1)) * (-1.0 if i in doubted else 1.0), axis)
+                for i, hand in enumerate(hands)
+            ]
+            _push(port, sample, pushes, clock)
+            for i, level in tuple(levels.items()):
+                answer, is_last = pushes[i].answer(hands[i]), level + 1 == len(LEVELS)
+                is_small = answer.is_wrong and pushes[i].way < TREMOR[axis // 3]
+                if not is_last and (is_small or answer.direction == Direction.UNKNOWN):
+                    levels[i] = level + 1
+                elif answer.is_wrong and doubted.get(i) != answer:
+                    doubted[i] = answer
+                else:
+                    answers[i].append(answer)
+                    del levels[i]
+    return [Probed(tuple(own), each.obstacle) for own, each in zip(answers, hands, strict=True)]
+
+
+def _push(port: Port, sample: NDArray[np.void], pushes: Sequence[Push], clock: Clock) -> None:
+    """Sends the forces, and notes the samples."""
+    wrench, begin = np.zeros((len(pushes), 6)), clock.now()
+    starts: dict[int, tuple[Array, Quaternion]] = {}
+    time = 0.0
+    while time < LEAD + len(SIGNS) * PULSE + MAX_DELAY:
+        clock.wait()
+        flags = port.read(sample)
+        time = 1e-9 * (clock.now() - begin)
+        for i, push in enumerate(pushes):
+            place, turn = sample["position"][i], quaternion_of(sample["quaternion"][i])
+            start = starts.setdefault(i, (place.copy(), turn))
+            if not flags[i] & int(TickFlag.STALE_SAMPLE):
+                is_linear = push.axis < 3
+                way = place - start[0] if is_linear else rotation_between(start[1], turn)
+                push.times.append(time)
+                push.places.append(tuple(way))
+            wrench[i, push.axis] = push.next_force(time)
+        port.write(wrench)

@@ -1,0 +1,276 @@
+"""The probe before the force: directions, delays, refusals, and what it gives the hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from audit_cases import rewritten
+from numpy.typing import NDArray
+from own_device import Array, OwnDevice
+from random_hands import random_hand
+from two_hands import SCENES, two_handed
+
+import hapticbridge as hb
+from hapticbridge.audit import audit
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.probe import Direction, Probed, ProbedHand, probe_devices
+from hapticbridge.device import Hand, Motion, SimulatedDevice
+
+T = 1e-3
+
+ARM, FINGERS, LIGHT = (0.65, 135.0, 6.5), (0.1, 30.0, 2.0), (0.04, 10.0, 0.5)
+"""Mass in kg, stiffness in N/m and damping in N s/m of hands, handle included."""
+
+Turn = Callable[[Array], Array]
+
+
+def _right(wrench: Array) -> Array:
+    return wrench
+
+
+def _reversed_y(wrench: Array) -> Array:
+    return wrench * (1.0, -1.0, 1.0, 1.0, 1.0, 1.0)
+
+
+def _exchanged(wrench: Array) -> Array:
+    x, y, *rest = wrench
+    return np.array([y, -x, *rest])
+
+
+class Wired(OwnDevice):
+    """An own device whose motors get another wrench than was written."""
+
+    def __init__(self, hand: tuple[float, float, float], turn: Turn = _right, **changes: Any):
+        mass, stiffness, damping = hand
+        own = dict[str, Any](mass=mass, start=(0.0, 0.0)) | changes
+        super().__init__((stiffness, damping), **own)
+        self._turn, self.reads = turn, 0
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        self.reads += 1
+        return super().read(sample)
+
+    def write(self, wrench: Array) -> None:
+        super().write(self._turn(wrench))
+
+
+def opened(device: OwnDevice, **options: Any) -> hb.Bridge:
+    options = dict[str, Any](probe=True, clock=hb.SimulatedClock()) | options
+    return hb.Bridge("virtual_wall", device, **options)
+
+
+@pytest.mark.parametrize("hand", [ARM, FINGERS, LIGHT])
+def test_a_device_that_moves_as_it_is_pushed_runs(
+    hand: tuple[float, float, float], tmp_path: Path
+) -> None:
+    device, path = Wired(hand), tmp_path / "run.mcap"
+    with opened(device, recording=path) as bridge:
+        summary = bridge.run(0.5)
+    assert summary.probe == "x, y, z answered the right way"
+    assert summary.is_certified
+    assert device.gained <= 1e-3  # with what the force itself moved
+    report = audit(path)
+    assert report.certified
+    assert report.resimulation == "bit for bit"
+    [event] = [e for e in hb.read_recording(path).events if e["event"] == "probe"]
+    assert event["axes"] == {"x": "right", "y": "right", "z": "right"}
+    assert event["added_delay"] == 0.0
+
+
+@pytest.mark.parametrize("hand", [ARM, FINGERS, LIGHT])
+@pytest.mark.parametrize(
+    ("turn", "words"),
+    [
+        (_reversed_y, "along y moved the device 'own' backwards: its axis y is reversed"),
+        (_exchanged, "along x moved the device 'own' along y: its axis x is exchanged"),
+    ],
+)
+def test_a_wrong_axis_is_refused_before_the_force(
+    hand: tuple[float, float, float], turn: Turn, words: str, tmp_path: Path
+) -> None:
+    device, path = Wired(hand, turn), tmp_path / "run.mcap"
+    with opened(device, recording=path) as bridge, pytest.raises(hb.SafetyTrip, match=words):
+        bridge.run(0.5)
+    assert device.gained <= 8e-3
+    recording = hb.read_recording(path)
+    assert len(recording.ticks) == 0
+    assert [e["event"] for e in recording.events][-3:] == ["probe", "trip", "stop"]
+
+
+def test_a_wrong_axis_behind_a_soft_coupling_gives_next_to_nothing() -> None:
+    """Without the probe it swings at 2 Hz, and the hand got up to 7 J."""
+    device = Wired(ARM, _exchanged)
+    coupling = hb.Coupling(150.0, 0.1)
+    with (
+        hb.Bridge(
+            "virtual_wall", device, coupling, clock=hb.SimulatedClock(), probe=True
+        ) as bridge,
+        pytest.raises(hb.SafetyTrip, match="its axis x is exchanged"),
+    ):
+        bridge.run(1.0)
+    assert device.gained <= 8e-3
+
+
+@pytest.mark.parametrize(("late", "stated"), [(5, 0), (3, 0), (5, 5), (0, 3)])
+def test_a_delay_counts_if_it_is_longer_than_the_stated_one(
+    late: int, stated: int, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    sheet: dict[str, Any] = {"delay": 1e-3 * stated, "is_delay_measured": True}
+    device = Wired(FINGERS, late=lambda _: late, **sheet)
+    with opened(device, recording=path) as bridge:
+        summary = bridge.run(0.3)
+    [event] = [e for e in hb.read_recording(path).events if e["event"] == "probe"]
+    added = 1e-3 * max(late - stated, 0)
+    assert event["added_delay"] == pytest.approx(added, abs=4e-4)
+    assert ("the force acts" in summary.probe) == (late > stated)
+    assert summary.is_certified is (late <= stated)
+    report = audit(path)
+    assert report.certified is (late <= stated)
+    assert ("forces follow" in report.reason) == (late > stated)
+
+
+def test_an_added_delay_that_is_no_time_is_refused_by_the_audit(tmp_path: Path) -> None:
+    path, damaged = tmp_path / "run.mcap", tmp_path / "damaged.mcap"
+    with opened(Wired(FINGERS), recording=path) as bridge:
+        bridge.run(0.1)
+    for value in ("soon", -1.0, 9.0):
+        events = [
+            each | {"added_delay": value} if each["event"] == "probe" else each
+            for each in hb.read_recording(path).events
+        ]
+        report = audit(rewritten(hb.read_recording(path), damaged, events=events))
+        assert report.verdict == "invalid"
+        assert "added_delay" in report.reason
+
+
+def test_a_hand_that_holds_too_firmly_is_not_judged() -> None:
+    """1 N moves it by 1 µm, and the encoder's step is 20 µm."""
+    device = Wired((0.5, 1e6, 100.0), _reversed_y, step=2e-5, resolution=2e-5)
+    with opened(device) as bridge:
+        summary = bridge.run(0.3)
+    assert summary.probe == "x, y, z could not be probed, as if held firmly"
+    assert device.gained <= 1e-3
+
+
+@pytest.mark.parametrize(
+    ("sheet", "options", "words"),
+    [
+        ({"rate": 100.0}, {}, "it gives a sample in 10 ms, and a probe needs one in 4 ms"),
+        ({"buttons": 1}, {"dead_man": 0}, "its force needs a button"),
+    ],
+)
+def test_a_device_that_cannot_be_probed_is_told_why(
+    sheet: dict[str, Any], options: dict[str, Any], words: str
+) -> None:
+    device = Wired(FINGERS, _reversed_y, **sheet)
+    with opened(device, **options, rate=1000.0) as bridge:
+        bridge.session.start_clock()
+        assert device.through == 0.0
+        assert bridge.summary().probe == f"not probed: {words}"
+
+
+@pytest.mark.parametrize(
+    ("is_real", "probe", "is_probed"),
+    [(True, None, True), (True, False, False), (False, None, False), (False, True, True)],
+)
+def test_real_devices_are_probed_unless_it_is_declined(
+    is_real: bool, probe: bool | None, is_probed: bool
+) -> None:
+    device = Wired(FINGERS)
+    device.info = replace(device.info, is_real=is_real)
+    clock = hb.RealClock() if is_real else hb.SimulatedClock()
+    assert opened(device, probe=probe, clock=clock).setup.is_probed is is_probed
+
+
+def test_a_prescribed_motion_is_never_probed() -> None:
+    device = Wired(FINGERS)
+    device.info = replace(device.info, is_prescribed=True, damping=None)
+    assert not opened(device).setup.is_probed
+
+
+class Port:
+    """Port to one simulated device, whose motors get another wrench."""
+
+    def __init__(self, device: SimulatedDevice, turn: Turn) -> None:
+        self._device, self._turn = device, turn
+
+    def read(self, sample: NDArray[np.void]) -> list[int]:
+        return [self._device.read(sample)]
+
+    def write(self, wrench: Array) -> None:
+        self._device.write(np.asarray(self._turn(wrench[0])))
+
+
+def probed(device: SimulatedDevice, turn: Turn) -> Probed:
+    clock, sample = SimulatedClock(), device.start(T)
+    clock.start(round(1e9 * T))
+    hands = [ProbedHand(device.info, Limits(force=10.0, torque=0.5), T)]
+    [found] = probe_devices(Port(device, turn), sample, hands, clock)
+    return found
+
+
+def test_random_hands_are_told_from_reversed_axes() -> None:
+    """Two fingers to an arm that grips hard, at rest, with steps of 20 µm."""
+    still = Motion([0.0, 9.0], [(0.0, 0.0, 0.0)] * 2)
+    for seed in range(12):
+        hand = random_hand(seed)
+        device = SimulatedDevice(hand=hand, path=still, resolution=2e-5)
+        right, wrong = probed(device, _right), probed(device, np.negative)
+        assert [each.direction for each in right.answers[:3]] == [Direction.RIGHT] * 3
+        assert not any(each.is_wrong for each in right.answers)
+        assert right.delay == 0.0
+        assert [each.direction for each in wrong.answers] == [Direction.REVERSED]
+
+
+def test_a_hand_that_trembles_is_not_taken_for_a_reversed_axis() -> None:
+    """A firm hand moves by 0.3 mm at 7 to 12 Hz, more than 1 N moves it."""
+    firm = Hand(mass=0.4, stiffness=3000.0, damping=40.0)
+    for seed in range(12):
+        generator, times = np.random.default_rng(seed), np.arange(0.0, 6.0, 2e-3)
+        turns = 2.0 * np.pi * generator.uniform(7.0, 12.0, 3) * times[:, None]
+        tremor = 3e-4 * np.sin(turns + generator.uniform(0.0, 6.0, 3))
+        for hand in (firm, random_hand(seed)):
+            device = SimulatedDevice(hand=hand, path=Motion(times, tremor), dof=3)
+            assert not any(each.is_wrong for each in probed(device, _right).answers)
+
+
+def test_a_stop_ends_the_probe_and_the_run() -> None:
+    device = Wired(FINGERS)
+    with opened(device) as bridge:
+        bridge.stop()
+        summary = bridge.run(1.0)
+    assert summary.ticks == 0
+    assert summary.probe == ""
+    assert device.through == 0.0
+
+
+def test_a_second_run_is_not_probed_again() -> None:
+    device = Wired(FINGERS)
+    with opened(device) as bridge:
+        bridge.run(0.1)
+        reads = device.reads
+        bridge.run(0.1)
+    assert device.reads == reads + 100
+
+
+def test_the_axis_of_one_of_two_hands_is_named() -> None:
+    good, bad = Wired(ARM), Wired(ARM, _reversed_y)
+    bad.info = replace(bad.info, name="second")
+    grasps = [hb.Grasp("left", good), hb.Grasp("right", bad)]
+    scene = two_handed(SCENES["bar"])
+    with (
+        hb.Bridge(scene, grasps, clock=hb.SimulatedClock(), probe=True) as bridge,
+        pytest.raises(hb.SafetyTrip, match="the device 'second' backwards"),
+    ):
+        bridge.run(0.3)
+    first, second = bridge.session.probed
+    assert first is not None
+    assert second is not None
+    assert not any(each.is_wrong for each in first.answers)
