@@ -38,6 +38,8 @@ REASONS = {
     # the loop
     "run/bridge.py: wait()": "a clock's: at most one period",
     "demand/guard.py: clock.wait()": "a clock's: at most one period",
+    "demand/probe.py: clock.wait()": "a clock's: at most one period",
+    "demand/probe.py: for line in self.answers": "no wait: answers of a device's axes",
     "identify/identify.py: clock.wait()": "a clock's: at most one period",
     "identify/z_width.py: self.clock.wait()": "a clock's: at most one period",
     "realtime/doctor.py: wait()": "a clock's: at most one period",

@@ -126,7 +126,8 @@ class Probed:
 
     def axes(self, direction: Direction) -> str:
         """Names of the axes with a direction."""
-        return ", ".join(each.axis for each in self.answers if each.direction == direction)
+        names = [each.axis for each in self.answers if each.direction == direction]
+        return ", ".join(names)
 
     def details(self, info: DeviceInfo, period: float) -> dict[str, object]:
         """Returns the details of the event, with the period T of the loop in s."""

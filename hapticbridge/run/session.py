@@ -536,17 +536,21 @@ class Session:
             device, hands = device.real_ones()
         newest = sample[hands]
         wait_until_still(device, newest, setup.period, self.clock, lambda: waiting)
-        if not self.tick and not waiting and any(self._setups[i].is_probed for i in hands):
-            self._probe(device, hands, newest)
         sample[hands] = newest
         if not self.tick and not waiting:
             self._refuse_stretched_start()
+            # a clock of another kind drives the device, which a probe would leave behind
+            keeps_time = type(self.clock) in (RealClock, SimulatedClock)
+            if keeps_time and any(self._setups[i].is_probed for i in hands):
+                self._probe(device, hands, newest)
+                sample[hands] = newest
+                self._refuse_stretched_start()
         self.clock.start(round(setup.period * 1e9))
         self._slept = slept_ns()
 
     def _probe(self, device: Device, hands: Sequence[int], sample: NDArray[np.void]) -> None:
         """Probes the devices of some hands, and records the findings; ``sample`` is theirs."""
-        clock = RealClock() if type(self.clock) is RealClock else SimulatedClock()
+        clock = type(self.clock)()  # the run's time begins with its first tick
         clock.start(round(self.setup.period * 1e9))
         setups, waiting = [self._setups[i] for i in hands], self.stop.waiting
         probed_hands = [
