@@ -540,7 +540,7 @@ class Session:
         if not self.tick and not waiting:
             self._refuse_stretched_start()
             # a clock of another kind drives the device, which a probe would leave behind
-            keeps_time = type(self.clock) in (RealClock, SimulatedClock)
+            keeps_time = isinstance(self.clock, RealClock | SimulatedClock)
             if keeps_time and any(self._setups[i].is_probed for i in hands):
                 self._probe(device, hands, newest)
                 sample[hands] = newest
