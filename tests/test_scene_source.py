@@ -297,6 +297,19 @@ def test_a_run_whose_recording_could_not_be_audited_says_so_at_its_start(
     assert audit(tmp_path / "run.mcap").verdict == "invalid"
 
 
+def test_no_room_for_the_copy_is_said_and_the_run_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(**_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("hapticbridge.run.unpacked.TemporaryDirectory", full)
+    with pytest.warns(UserWarning, match="could not be audited: .*No space left on device"):
+        recorded(tmp_path / "run.mcap", load_scene("point_mass"), duration=0.1)
+    monkeypatch.undo()
+    assert audit(tmp_path / "run.mcap").resimulation == "bit for bit"
+
+
 @pytest.mark.parametrize("name", ["peg_in_hole", "bench_pliers", "screwdriver"])
 def test_a_run_whose_recording_can_be_audited_says_nothing(tmp_path: Path, name: str) -> None:
     with warnings.catch_warnings():

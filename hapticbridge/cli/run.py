@@ -112,6 +112,11 @@ def announce(setup: RunSetup, named: Mapping[str, float], *, is_method_chosen: b
         err.print(f"[yellow]warning:[/yellow] {escape(method.hazard)}")
     if setup.scene_ticks:
         _announce_slow(setup)
+    if setup.is_probed:
+        err.print(
+            "  the device is first pushed a little along each axis, to see that it goes the right "
+            "way (--no-probe)"
+        )
     _announce_damping(setup, named)
     _announce_own_rate(setup)
     for sentence in _without_motor(setup):

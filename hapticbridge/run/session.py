@@ -562,12 +562,12 @@ class Session:
             )
             for each in setups
         ]
-        found = probe_devices(ProbedPort(device), sample, probed_hands, clock, lambda: waiting)
-        for i, each, probed in zip(hands, setups, found, strict=True):
+        results = probe_devices(ProbedPort(device), sample, probed_hands, clock, lambda: waiting)
+        for i, each, probed in zip(hands, setups, results, strict=True):
             self.probed[i] = probed
             grip = {"grip": each.scene.grip} if len(self._setups) > 1 else {}
             self.event(PROBE_EVENT, **grip, **probed.details(each.info, each.period))
-        for each, probed in zip(setups, found, strict=True):
+        for each, probed in zip(setups, results, strict=True):
             probed.refuse_wrong_axes(each.info)
 
     def take_changes(self) -> None:

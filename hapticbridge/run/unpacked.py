@@ -106,7 +106,7 @@ def warn_of_other_scene(
             prepare(again)
             is_equal = model_digest(again.model) == model_digest(scene.model)
         reason = "its files compile to another model; was it changed after it was loaded?"
-    except HapticBridgeError as error:
+    except (HapticBridgeError, OSError) as error:  # such as no room for the copy
         is_equal, reason = False, str(error)
     if not is_equal:
         concern = f"the recording could not be audited: {reason}"
