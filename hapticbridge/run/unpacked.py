@@ -95,7 +95,8 @@ def warn_of_other_scene(
         prepare: Prepares a loaded scene as this one was prepared.
 
     Warns:
-        UserWarning: The audit of the recording would refuse its scene, and why.
+        UserWarning: The audit of the recording would refuse its scene, and why, or this could not
+            be tried.
     """
     files = {each.name: each.data for each in attachments(scene)}
     try:
@@ -106,8 +107,10 @@ def warn_of_other_scene(
             prepare(again)
             is_equal = model_digest(again.model) == model_digest(scene.model)
         reason = "its files compile to another model; was it changed after it was loaded?"
-    except (HapticBridgeError, OSError) as error:  # such as no room for the copy
-        is_equal, reason = False, str(error)
-    if not is_equal:
-        concern = f"the recording could not be audited: {reason}"
+        concern = "" if is_equal else f"the recording could not be audited: {reason}"
+    except OSError as error:  # such as no room for the copy
+        concern = f"whether the recording can be audited was not tried: {error.strerror}"
+    except HapticBridgeError as error:
+        concern = f"the recording could not be audited: {error}"
+    if concern:
         warnings.warn(SceneWarning(scene.path, concern), stacklevel=2)
