@@ -27,7 +27,7 @@ def scene_text(bodies: str, rest: str = "") -> str:
 
 
 def started_said(scene: Scene) -> list[str]:
-    return [change for change in scene.changes if change.startswith("start of")]
+    return [change for change in scene.changes if change.startswith("start")]
 
 
 def error(scene: Scene) -> float:
@@ -281,3 +281,43 @@ def test_a_load_that_sinks_in_the_hand_is_named_with_its_energy(tmp_path: Path) 
     words = f"gave the hand {1e3 * released:.3g} mJ, as weights that sink and springs do"
     assert words in str(summary)
     assert words in hb.audit(tmp_path / "run.mcap").reason
+
+
+CUP = """<body name="cup" pos="0 0 .03"><freejoint/>
+  <geom name="cup" type="box" size=".02 .02 .02" mass=".1"/></body>
+  <geom name="table" type="box" size=".1 .1 .02"/>"""
+"""Box that begins 10 mm inside a fixed one."""
+CAUGHT = CUP + '<geom name="lid" type="box" size=".1 .1 .02" pos="0 0 .06"/>'
+"""The same box between two fixed ones that leave it no room."""
+
+
+def depth(scene: Scene) -> float:
+    """Returns the deepest overlap at the start in m, by MuJoCo."""
+    return float((-scene.data.contact.dist).max(initial=0.0))
+
+
+def test_parts_that_begin_inside_each_other_are_moved_apart_before_the_run(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, scene_text(CUP)))
+    assert depth(scene) < 1e-8
+    assert started_said(scene) == [
+        "start where geom 'table' and geom 'cup' overlap by 10 mm → closed",
+        "start of body 'cup': moved by 10 mm",
+    ]
+    # the file itself starts inside the table, and nothing there touches the tool
+    assert depth(load_scene(scene_file(tmp_path, scene_text(CUP)), as_is=True)) > 9e-3
+
+
+def test_box_between_two_walls_without_room_is_held_there_and_said(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, scene_text(CAUGHT)))
+    assert depth(scene) == pytest.approx(0.01, abs=1e-6)
+    (said,) = started_said(scene)
+    assert "pushed out at once → held" in said
+
+
+def test_start_out_of_the_table_is_where_the_scenes_own_contacts_push_it(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, scene_text(CUP)))
+    model = mujoco.MjModel.from_xml_string(scene_text(CUP))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 2000)
+    rest = scene.data.body("cup").xpos
+    assert rest == pytest.approx(data.body("cup").xpos, abs=1e-3)

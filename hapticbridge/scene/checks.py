@@ -429,6 +429,12 @@ def overlaps(model: mujoco.MjModel, data: mujoco.MjData, depth: float) -> list[O
     return list(by_words.values())
 
 
+def listed(overlapping: list[Overlap]) -> str:
+    """Returns the deepest of some overlaps, and the number of the others."""
+    count = len(overlapping) - 1
+    return str(overlapping[0]) + (f" (and {count} more pair{'s' * (count > 1)})" if count else "")
+
+
 def refuse_overlap(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
     """Refuses a start in which the tool penetrates a body, for contacts that would push it out.
 

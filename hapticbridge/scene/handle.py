@@ -35,6 +35,7 @@ from hapticbridge.scene.checks import (
     Overlap,
     ancestors,
     is_nested,
+    listed,
     overlaps,
 )
 from hapticbridge.scene.compile import SceneChange, go_to_start
@@ -579,7 +580,7 @@ def exclude_nested(
         for body_id in (first, second):
             bodies[body_id].name = bodies[body_id].name or f"{PREFIX}body_{body_id}"
         spec.add_exclude(bodyname1=bodies[first].name, bodyname2=bodies[second].name)
-    where = _listed(list(pairs.values()))
+    where = listed(list(pairs.values()))
     return (SceneChange(f"contact where {where} at the start: on → off"),)
 
 
@@ -587,13 +588,8 @@ def announce_overlaps(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Scene
     """Returns the change in the treatment of what overlaps at the start."""
     if overlapping := overlaps(model, data, NOTABLE_OVERLAP):
         words = (
-            f"start where {_listed(overlapping)}: pushed out at once → held, and eased out with "
+            f"start where {listed(overlapping)}: pushed out at once → held, and eased out with "
             "energy that the scene has dissipated"
         )
         return (SceneChange(words, "start"),)
     return ()
-
-
-def _listed(overlapping: list[Overlap]) -> str:
-    count = len(overlapping) - 1
-    return str(overlapping[0]) + (f" (and {count} more pair{'s' * (count > 1)})" if count else "")

@@ -1,8 +1,8 @@
-"""Start of a scene on its own constraints: limits and equality constraints that hold in its pose.
+"""Start of a scene on its own constraints: limits, equalities and contacts that hold in its pose.
 
-A file may start with an elbow beyond its limit, or with a weld whose parts are apart. Rigid
-constraints would hold that violation for the whole run, and soft ones would release its energy
-into the hand. The start is therefore moved onto the constraints before there is a force.
+A file may start with an elbow beyond its limit, a weld whose parts are apart, or a cup inside a
+table. Rigid constraints would hold that violation for the whole run, and soft ones would release
+its energy into the hand. The start is therefore moved onto the constraints before there is a force.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.scene.checks import NOTABLE_OVERLAP, listed, overlaps
 from hapticbridge.scene.compile import SceneChange, reset
 
 VIOLATION = 1e-4
@@ -38,6 +39,7 @@ _ROWS = {
     int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT): "joint",
     int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON): "tendon",
 }
+_CONTACTS = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
 _KINDS = {
     int(mujoco.mjtEq.mjEQ_CONNECT): "connect",
     int(mujoco.mjtEq.mjEQ_WELD): "weld",
@@ -62,16 +64,19 @@ class Start(NamedTuple):
 
 
 def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Start:
-    """Projects the start of a compiled scene onto its limits and equality constraints.
+    """Projects the start of a compiled scene onto its limits, equalities and contacts.
 
     Hinges and slides go to their limits alone. Each further step solves, by MuJoCo's own Newton
     solver with stiff constraints at rest,
 
         min ½ Δqᵀ M Δq    with    J Δq = −r for equalities,    J Δq >= −r for violated limits
+                                                               and for parts that overlap
 
     with the inertia matrix M, the constraints' Jacobian J and their violation r. Weight, springs,
-    motors, dry friction and contacts give no force. Without them a scene's own soft constraints
-    come to rest at r = 0 too. An equality that cannot be closed is left out and described.
+    motors and friction give no force. Without them a scene's own soft constraints come to rest at
+    r = 0 too. An equality that cannot be closed is left out and described. Contacts are left out
+    if no pair overlaps by ``NOTABLE_OVERLAP``, and if with them a limit or an equality stays
+    violated or the deepest overlap does not become smaller, as of a peg within the hull of a hole.
 
     Args:
         model: Compiled scene; it is not changed.
@@ -79,8 +84,11 @@ def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Sta
     """
     trial, data = _without_forces(model)
     start, first = data.qpos.copy(), _violations(trial, data)
-    if max(first.values(), default=0.0) <= VIOLATION:
-        return Start(None, (), ())
+    inside = overlaps(trial, data, NOTABLE_OVERLAP)
+    if not inside or not is_moved:
+        _leave_contacts(trial)
+        if max(first.values(), default=0.0) <= VIOLATION:
+            return Start(None, (), ())
     end, last = (_projected(trial, data) if is_moved else start), first
     if is_moved:
         data.eq_active[:] = model.eq_active0
@@ -96,6 +104,9 @@ def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Sta
         for row, size in first.items()
         if size > VIOLATION and row not in still and row[0] != "joint"
     ]
+    left = {each.words for each in overlaps(model, _at(model, end), NOTABLE_OVERLAP)}
+    if closed := [each for each in inside if each.words not in left]:
+        words.append(f"start where {listed(closed)} → closed")
     limited = {row[1] for row, size in first.items() if row[0] == "joint" and size > VIOLATION}
     words += _moved(model, start, end, limited)
     changes = tuple(map(SceneChange, _at_most(words, "parts of the scene")))
@@ -103,17 +114,21 @@ def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Sta
 
 
 def _projected(trial: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
-    """Returns the positions on all constraints; without those equalities that cannot be closed."""
-    start = data.qpos.copy()
-    for _ in range(2):
+    """Returns the positions on all constraints; without those that cannot be closed."""
+    start, before = data.qpos.copy(), _depth(data)
+    for _ in range(3):
         data.qpos[:] = start
         _clamp_joints(trial, data)
         for _ in range(MAX_STEPS):
             mujoco.mj_forward(trial, data)
             sizes = _violations(trial, data)
-            if max(sizes.values(), default=0.0) <= CLOSED or not np.isfinite(data.qacc).all():
+            if max([_depth(data), *sizes.values()]) <= CLOSED or not np.isfinite(data.qacc).all():
                 break
             mujoco.mj_integratePos(trial, data.qpos, data.qacc, 1.0)
+        if before and (max(sizes.values(), default=0.0) > VIOLATION or _depth(data) >= before):
+            _leave_contacts(trial)
+            before = 0.0
+            continue
         still = [row[1] for row, size in sizes.items() if row[0] == "equality" and size > VIOLATION]
         if not still:
             break
@@ -121,6 +136,24 @@ def _projected(trial: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64
     if not np.isfinite(data.qpos).all():
         data.qpos[:] = start
     return np.array(data.qpos)
+
+
+def _depth(data: mujoco.MjData) -> float:
+    """Returns the depth in m of the deepest contact that a joint can answer."""
+    return float((-data.efc_pos[data.efc_type == _CONTACTS]).max(initial=0.0))
+
+
+def _at(model: mujoco.MjModel, positions: NDArray[np.float64]) -> mujoco.MjData:
+    """Returns the contacts of a scene at positions (nq,)."""
+    data = mujoco.MjData(model)
+    reset(model, data)
+    data.qpos[:] = positions
+    mujoco.mj_fwdPosition(model, data)
+    return data
+
+
+def _leave_contacts(trial: mujoco.MjModel) -> None:
+    trial.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
 
 def _clamp_joints(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -139,14 +172,17 @@ def _without_forces(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjDat
     Its acceleration is the step Δq, as k = 1/s² asks for a = −r.
     """
     trial, disable = copy.copy(model), mujoco.mjtDisableBit
-    for flag in ("SPRING", "DAMPER", "GRAVITY", "ACTUATION", "FRICTIONLOSS", "CONTACT", "REFSAFE"):
+    for flag in ("SPRING", "DAMPER", "GRAVITY", "ACTUATION", "FRICTIONLOSS", "REFSAFE"):
         trial.opt.disableflags |= int(getattr(disable, f"mjDSBL_{flag}"))
     trial.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     trial.opt.gravity[:] = trial.opt.wind[:] = 0.0
     trial.opt.tolerance, trial.opt.iterations = 0.0, 100
-    for name in ("eq_sol{}", "jnt_sol{}", "tendon_sol{}_lim"):
-        getattr(trial, name.format("ref"))[:] = -1.0, 0.0
-        getattr(trial, name.format("imp"))[:] = STIFF, STIFF, 1.0, 0.5, 2.0
+    trial.geom_condim[:] = trial.pair_dim[:] = trial.flex_condim[:] = 1
+    laws = [(trial, name) for name in ("eq_sol{}", "jnt_sol{}", "tendon_sol{}_lim")]
+    laws += [(trial, f"{name}_sol{{}}") for name in ("geom", "pair", "flex")]
+    for holder, name in (*laws, (trial.opt, "o_sol{}")):
+        getattr(holder, name.format("ref"))[:] = -1.0, 0.0
+        getattr(holder, name.format("imp"))[:] = STIFF, STIFF, 1.0, 0.5, 2.0
     data = mujoco.MjData(trial)
     reset(trial, data)
     data.qvel[:] = 0.0
