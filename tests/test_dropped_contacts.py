@@ -105,6 +105,20 @@ def test_more_memory_than_the_default_is_kept(tmp_path: Path) -> None:
     assert not any("memory" in change for change in scene.changes)
 
 
+@pytest.mark.parametrize("size", ['memory="3G"', 'njmax="8000" nconmax="4000"'])
+def test_memory_of_gigabytes_is_reduced_and_the_run_can_be_audited(
+    tmp_path: Path, size: str
+) -> None:
+    path, recording = tmp_path / "scene.xml", tmp_path / "run.mcap"
+    path.write_text(PLATE.format(f" {size}"))
+    run(path, recording)
+    scene = load_scene(path)
+    assert scene.model.narena == 128 << 20
+    (change,) = (each for each in scene.changes if "memory" in each)
+    assert change.endswith("→ 134 MB")
+    assert audit(recording).words == "passive (strict)"
+
+
 @pytest.mark.parametrize(
     ("options", "memory", "reason"),
     [
@@ -174,7 +188,7 @@ def test_a_start_that_does_not_fit_is_refused(
     path.write_text(TRAY.replace("0.025", height))
     code, _, err = call("run", path, "--fast", "--duration", 0.1)
     assert code == 2
-    assert "memory holds no more" in one_sentence(err)
+    assert "<size memory=" in one_sentence(err)
     assert "MuJoCo warns" not in err
     assert [each.name for each in file_decides.iterdir()] == ["tray.xml"]
 

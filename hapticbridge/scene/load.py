@@ -247,15 +247,41 @@ def plain_model(source: SceneSource) -> mujoco.MjModel:
     """
     spec = source.spec.copy()
     with suppress(ValueError):
-        return spec.compile()
+        return _compiled(spec)[0]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     with _refused(source.path):
-        return spec.compile()
+        return _compiled(spec)[0]
+
+
+def _compiled(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, tuple[SceneChange, ...]]:
+    """Compiles a scene with a memory within its limits; returns the model and the change."""
+    before, rows = spec.memory, max(spec.njmax, spec.nconmax)
+    if before > MAX_MEMORY or rows > MAX_ROWS:  # before MuJoCo itself reserves it to compile
+        spec.memory, spec.nstack, spec.njmax, spec.nconmax = MAX_MEMORY, -1, -1, -1
+        asked = format_si(before, "B") if before > MAX_MEMORY else f"for {rows} rows"
+        change = SceneChange(f"memory: {asked} → {format_si(MAX_MEMORY, 'B')}")
+        return spec.compile(), (change,)
+    model = spec.compile()
+    if model.narena >= MIN_MEMORY:
+        return model, ()
+    before, spec.memory, spec.nstack, spec.njmax = model.narena, -1, -1, -1
+    model = spec.compile()
+    sizes = (format_si(size, "B") for size in (before, model.narena))
+    return model, (SceneChange(f"memory: {' → '.join(sizes)}"),)
 
 
 MIN_MEMORY = 13 << 20
 """Memory in bytes that MuJoCo gives the smallest scene by default, for contacts and constraints. A
 scene with less in its file gets the default, because a full memory drops contacts."""
+
+MAX_MEMORY = 128 << 20
+"""Memory in bytes that a scene gets at most. Each copy of its state reserves as much, and an audit
+has a limit of memory. It holds 3000 rows of constraints with all their products, ten times what a
+step of 1 ms has time for, and a run whose contacts need more is ended (``kernel.codes``)."""
+
+MAX_ROWS = 1000
+"""Largest ``njmax`` or ``nconmax`` that is kept; MuJoCo reserves 50 MB for 1000 and 3 GB for 8000,
+as old files ask for. More rows get ``MAX_MEMORY``."""
 
 
 def compile_scene(
@@ -294,12 +320,8 @@ def compile_scene(
         about_grip = [said for each in grips for said in add_grip(spec, each)]
     attach_handles(spec, grips)
     with _refused(path):
-        model = spec.compile()
-        if model.narena < MIN_MEMORY:
-            before, spec.memory, spec.nstack, spec.njmax = model.narena, -1, -1, -1
-            model = spec.compile()
-            sizes = (format_si(size, "B") for size in (before, model.narena))
-            changes += (SceneChange(f"memory: {' → '.join(sizes)}"),)
+        model, sized = _compiled(spec)
+        changes += sized
         if not as_is and (excluded := exclude_nested(spec, model, grips[0])):
             changes, model = changes + excluded, spec.compile()
         concerns = [*source.concerns, *about_grip]
