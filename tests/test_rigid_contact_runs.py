@@ -200,12 +200,14 @@ def test_rigid_contacts_are_strict_at_other_periods(period: float) -> None:
 
 def run_with(flags: str, bit: int, case: Case) -> LoopOutcome:
     """Runs a case with a bit of MuJoCo's options set."""
-    option = loop_in(rigs.RIGS[case.rig].load, "contact").scene.model.opt
-    own = getattr(option, flags)
+    scene = loop_in(rigs.RIGS[case.rig].load, "contact").scene
+    scene.set_contact(is_rigid=False)  # the options are then the scene's own
+    option, own = scene.model.opt, getattr(scene.model.opt, flags)
     setattr(option, flags, own | bit)
     try:
         return run_case(rigs.RIGID, case, keep_records=True)
     finally:
+        scene.set_contact(is_rigid=False)
         setattr(option, flags, own)
 
 

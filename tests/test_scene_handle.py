@@ -191,7 +191,6 @@ def test_users_scene_moves_as_without_the_bridge_where_the_tool_is_apart(tmp_pat
     scene.set_timestep(0.001)
     spec = mujoco.MjSpec.from_file(str(path))
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
-    spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_DIAGEXACT.value
     spec.option.timestep = 0.001
     model = spec.compile()
     data = mujoco.MjData(model)

@@ -56,6 +56,7 @@ def _rigid_options(option: mujoco.MjOption) -> dict[str, Any]:
         "cone": mujoco.mjtCone.mjCONE_ELLIPTIC,
         "impratio": IMPRATIO,
         "noslip_iterations": 0,
+        "enableflags": option.enableflags | int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT),
         # it stands for all margins where the file overrides them, and cannot follow the speed
         "o_margin": max(option.o_margin, MAX_MARGIN if _overrides(option) else MARGIN),
         **{
@@ -227,8 +228,9 @@ class Scene:
         """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
 
         Rigid contacts have an elliptic cone of friction, the regularisation of friction divided by
-        ``IMPRATIO``, no pass of the solver ``noslip``, a margin beyond the file's, limits of
-        the solver no laxer than MuJoCo's own, and the points of ``kernel.colliders``.
+        ``IMPRATIO``, no pass of the solver ``noslip``, the exact diagonal, a margin beyond the
+        file's, limits of the solver no laxer than MuJoCo's own, and the points of
+        ``kernel.colliders``.
         """
         model, own = self.model, self._own_contact
         if is_rigid == bool(own):
