@@ -251,7 +251,7 @@ def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]
         setup.method.has_law and HEAVY * setup.limits.force < in_hand < math.inf
     ):
         return
-    sag = format_si(load / parameters.coupling.stiffness, "m")
+    scale, sag = in_hand / load, format_si(load / parameters.coupling.stiffness, "m")
     others = static_load(setup.scene, parameters, has_weight=False)[:3]
     if 2.0 * float(np.linalg.norm(others)) > load:
         yield (
@@ -264,15 +264,12 @@ def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]
             'hangs or lies on the tool, whose weight is carried; gravcomp="1" in these bodies '
             "carries them"
         )
-    elif 10.0 * float(np.linalg.norm(others)) > load:
-        yield (
-            f"at rest the hand bears {format_si(in_hand, 'N')}, {sag} beside the handle, most of "
-            "it the tool's weight; --no-tool-weight carries that"
-        )
     else:
+        carried = static_load(setup.scene.with_tool_carried(), parameters)[:3]
+        left = format_si(scale * float(np.linalg.norm(carried)), "N")
         yield (
             f"this tool weighs {format_si(in_hand, 'N')} in the hand, which holds it {sag} beside "
-            "the handle; --no-tool-weight carries it"
+            f"the handle; --no-tool-weight carries it (tried: the hand then bears {left})"
         )
 
 

@@ -179,9 +179,9 @@ def _settled_load(scene: Scene, parameters: RunParameters) -> NDArray[np.float64
     momentum, last, load = np.zeros(model.nv), 0.0, np.zeros(6)
     with closing(rehearsal.steps(grip, SETTLING_STEPS)) as steps:
         for count, wrench in enumerate(steps):
-            velocity = np.where(dofs, data.qvel, 0.0)
-            if np.abs(velocity).max(initial=0.0) < AT_REST * model.opt.timestep:
+            if np.abs(data.qvel).max(initial=0.0) < AT_REST * model.opt.timestep:
                 return _turned(grip, wrench)
+            velocity = np.where(dofs, data.qvel, 0.0)
             mujoco.mj_mulM(model, data, momentum, velocity)
             kinetic = 0.5 * float(velocity @ momentum)
             if kinetic < last:

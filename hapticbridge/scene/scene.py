@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -315,6 +316,13 @@ class Scene:
             words += f", but not that of {choices(loads)} on its tendons"
         self.differences += (SceneChange(words, reason=reason),)
         self.reset()
+
+    def with_tool_carried(self) -> Scene:
+        """Returns a copy that carries its tool's weight (``carry_tool``), for a trial."""
+        trial = copy.copy(self)
+        trial._spec = self._spec.copy() if self._spec else None
+        trial.carry_tool("")
+        return trial
 
     def _recompile(self, spec: mujoco.MjSpec) -> None:
         model = spec.compile()
