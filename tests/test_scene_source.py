@@ -297,6 +297,19 @@ def test_a_run_whose_recording_could_not_be_audited_says_so_at_its_start(
     assert audit(tmp_path / "run.mcap").verdict == "invalid"
 
 
+@pytest.mark.parametrize("most", [1e6, 1e8])
+def test_a_scene_that_is_too_large_for_a_confined_audit_is_said_to_need_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: float
+) -> None:
+    monkeypatch.setattr("hapticbridge.run.unpacked.LARGE", most)
+    text = mjcf('<asset><texture name="t" builtin="flat" width="1024" height="1024"/></asset>')
+    scene = load_scene(scene_file(tmp_path, text))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        recorded(tmp_path / "run.mcap", scene, duration=0.1)
+    assert any("--in-process" in str(each.message) for each in said) == (most == 1e6)
+
+
 def test_no_room_for_the_copy_is_said_and_the_run_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -441,7 +454,8 @@ def test_a_scene_that_compiles_too_long_or_takes_too_much_ends_in_a_sentence(
 ) -> None:
     nest = f"{3 * GRID}<geom size='.1'/>{3 * '</replicate>'}"
     (tmp_path / "long.xml").write_text(mjcf(world=nest))
-    (tmp_path / "large.xml").write_text(mjcf('<size memory="6400M"/>'))
+    texture = '<texture name="t" builtin="flat" width="30000" height="30000"/>'
+    (tmp_path / "large.xml").write_text(mjcf(f"<asset>{texture}</asset>"))
     program = (
         "import sys; from hapticbridge import confinement\n"
         "from hapticbridge.cli.main import main\n"

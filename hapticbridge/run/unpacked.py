@@ -7,14 +7,20 @@ from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
+from hapticbridge.confinement import MEMORY
 from hapticbridge.errors import HapticBridgeError, RecordingError, SceneWarning
 from hapticbridge.run.description import SOURCE_PREFIX, attachments, model_digest
 from hapticbridge.run.request import RunRequest
 from hapticbridge.scene import Scene, load_scene, scene_parameters
 from hapticbridge.scene.source import refuse_outside
+from hapticbridge.units import format_si
 
 MAX_STEPS = 4
 """Names that one path is joined from: asset folder, name in an include, in a model, in a file."""
+
+LARGE = 0.4 * MEMORY
+"""Size of a compiled scene in bytes above which a confined audit may refuse it: with 0.4 and 0.6 of
+its memory in textures, one was compiled and one refused."""
 
 
 def unpack_scene(recording: Path, files: Mapping[str, bytes], folder: Path) -> Path:
@@ -108,6 +114,11 @@ def warn_of_other_scene(
             is_equal = model_digest(again.model) == model_digest(scene.model)
         reason = "its files compile to another model; was it changed after it was loaded?"
         concern = "" if is_equal else f"the recording could not be audited: {reason}"
+        if is_equal and (size := scene.model.nbuffer) > LARGE:
+            concern = (
+                f"it takes {format_si(size, 'B')}, more than an audit allows a foreign scene: "
+                "audit the recording with --in-process, or make textures and meshes smaller"
+            )
     except OSError as error:  # such as no room for the copy
         concern = f"whether the recording can be audited was not tried: {error.strerror}"
     except HapticBridgeError as error:
