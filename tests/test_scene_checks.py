@@ -62,7 +62,6 @@ def test_a_file_goes_before_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (mjcf("<asset><mesh name='m' file='gone.stl'/></asset>"), ["'gone.stl'"]),
         (mjcf("<asset><texture name='t' type='2d' file='gone.png'/></asset>"), ["'gone.png'"]),
         (mjcf(world="<body name='tool'/>"), ["repeated name 'tool'"]),
-        (mjcf("<size memory='1P'/>"), ["memory", "<size>"]),
         # what switches the coupling off or cannot be simulated again
         (mjcf("<option><flag ipc='enable'/></option>"), ["flag ipc", "disable it"]),
     ],
@@ -159,9 +158,6 @@ def test_options_that_exclude_the_coupling_are_changed_and_told(
 def test_what_does_unmetered_work_is_warned_of(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="wind does work"):
         load_scene(scene_file(tmp_path, mjcf("<option wind='1 0 0'/>")))
-    belt = "<geom name='belt' type='plane' size='1 1 1' pos='0 0 -1' surfacevel='1 0 0 0 0 0'/>"
-    with pytest.warns(UserWarning, match="surfacevel does work"):
-        load_scene(scene_file(tmp_path, mjcf(world=belt)))
 
 
 def test_options_and_timestep_are_set_whatever_the_file_says(tmp_path: Path) -> None:
@@ -172,7 +168,7 @@ def test_options_and_timestep_are_set_whatever_the_file_says(tmp_path: Path) -> 
     enable, disable = mujoco.mjtEnableBit, mujoco.mjtDisableBit
     assert opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
     assert opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
-    for bit in (enable.mjENBL_ENERGY, enable.mjENBL_DIAGEXACT, enable.mjENBL_FWDINV):
+    for bit in (enable.mjENBL_ENERGY, enable.mjENBL_FWDINV):
         assert opt.enableflags & bit
     for bit in (disable.mjDSBL_AUTORESET, disable.mjDSBL_MIDPHASE):
         assert opt.disableflags & bit

@@ -20,7 +20,7 @@ from hapticbridge.check.run_faults import run_faults
 from hapticbridge.errors import choices
 from hapticbridge.run.fidelity import fidelity
 from hapticbridge.scene import compile_scene
-from hapticbridge.scene.checks import check_model, first_pump
+from hapticbridge.scene.checks import first_pump
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.fault import Fault
 from hapticbridge.scene.first_faults import (
@@ -61,14 +61,9 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
                 f"the scene runs with a change, {change}",
                 "run --as-is, which refuses the scene",
             )
-    found = (
-        ("wind", case.source.concerns),
-        ("surfacevel", check_model(case.model, case.scene.grip)),
-    )
-    for attribute, concerns in found:
-        place = places.with_attribute(attribute) or places.option(attribute)
-        for concern in concerns:
-            yield Fault("unmetered work", place, concern, f"remove {attribute}")
+    place = places.with_attribute("wind") or places.option("wind")
+    for concern in case.source.concerns:
+        yield Fault("unmetered work", place, concern, "remove wind")
 
 
 def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:

@@ -88,8 +88,8 @@ _LIMIT_MOTORS = (
     "may get"
 )
 _LIMIT_INPUTS = (
-    "the scene's inputs (applied forces, moved mocap bodies) {} until then: make them smaller or "
-    "slower; if they are meant to push the hand, --energy-limit is what it may get"
+    "the scene's inputs (applied forces, moved mocap bodies, belts) {} until then: make them "
+    "smaller or slower; if they are meant to push the hand, --energy-limit is what it may get"
 )
 _FIND_PUMP = (
     "the scene itself created {} until then: 'hapticbridge check SCENE' looks for what pumps, and "

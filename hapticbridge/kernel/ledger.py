@@ -400,6 +400,35 @@ def _applied_work(s: State) -> float:
 
 
 @compiled
+def _belt_work(s: State) -> float:
+    """Returns the work of surfaces that move by themselves (``surfacevel``) through friction, in J.
+
+        W = −h Σ f_i s_i
+
+    f_i is the friction of a contact along its tangents and about its normal, s_i the velocity of
+    the second geom's surface relative to the first one's, which MuJoCo adds to J v. What the
+    friction loses against the moving surface is dissipated by the contact.
+    """
+    mj, power = s.mj, 0.0
+    count = ints(mj.nefc, 1)[0]
+    force, kinds = floats(pointer_at(mj.efc_force), count), ints(pointer_at(mj.efc_type), count)
+    for c in range(ints(mj.ncon, 1)[0]):
+        contact = pointer_at(mj.contact) + c * mj.contact_size
+        row, dim = ints(contact + mj.contact_row, 1)[0], ints(contact + mj.contact_dim, 1)[0]
+        if row < 0:
+            continue
+        velocity = floats(contact + mj.contact_surface_velocity, 3)
+        friction = floats(contact + mj.contact_friction, 5)
+        for i in range(min(dim - 1, 3)):
+            if kinds[row] == CONTACT_PYRAMIDAL:  # two edges, n + µ t and n − µ t
+                first = row + 2 * i
+                power -= friction[i] * (force[first] - force[first + 1]) * velocity[i]
+            else:
+                power -= force[row + 1 + i] * velocity[i]
+    return float(s.run.timestep * power)
+
+
+@compiled
 def meter_ports(s: State) -> None:
     """Adds the work of the step that just ended to the actuator port and the external port.
 
@@ -421,6 +450,8 @@ def meter_ports_again(s: State) -> None:
         energy.actuator_work += work - energy.step_actuator_work
         energy.step_actuator_work = work
     work = _applied_work(s)
+    if s.mj.has_belts:
+        work += _belt_work(s)
     if energy.mocap_has_moved:
         work += mocap_work(s)
     energy.external_work += work - energy.step_external_work

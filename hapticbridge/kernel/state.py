@@ -357,6 +357,7 @@ class BoundKernel:
             mj[name] = value
         self._own({"grip_dofs": dofs})
         mj["has_actuators"] = model.nactuator > own or bool(np.any(model.jnt_actgravcomp))
+        mj["has_belts"] = np.any(model.geom_surfacevel)
         if parameters.scheme == Scheme.MASSLESS:
             self._own(massless_tool(model, grip))
             mj["tool_map_size"] = self._owned["tool_map"].size

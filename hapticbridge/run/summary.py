@@ -83,7 +83,7 @@ class Ledger:
         potential: Present potential energy of gravity, its compensation, and springs.
         coupling_work: Work of the coupling on the tool, Σ f_k·δx_k + τ_k·δφ_k.
         actuator_work: Work of the scene's own actuators.
-        external_work: Work of applied forces, moved mocap bodies and resets.
+        external_work: Work of applied forces, moved mocap bodies, moving surfaces and resets.
         environment_energy: Σ E_k: energy created (> 0) or dissipated (< 0) by the simulation.
         device_energy: Energy given to the device by the wrenches sent.
         slack: Bound of Σ E_k up to which the guarantee holds.

@@ -306,8 +306,8 @@ def _number(word: str) -> float:
         return 0.0  # not a number; MuJoCo's own message is more specific
 
 
-def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
-    """Refuses a compiled model that cannot be coupled; returns warnings.
+def check_model(model: mujoco.MjModel, grip: str) -> None:
+    """Refuses a compiled model that cannot be coupled.
 
     Raises:
         SceneError: Masses or inertias are not finite, the grip cannot move, or a default of the
@@ -328,13 +328,6 @@ def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
         )
     for name in COUPLING_ACTUATORS:
         _check_coupling_actuator(model, name)
-    warnings = []
-    if np.any(model.geom_surfacevel):
-        warnings.append(
-            "a geom's surfacevel does work on the scene that no port meters; the audit may report "
-            "the environment as active"
-        )
-    return warnings
 
 
 def ancestors(model: mujoco.MjModel, body_id: int) -> list[int]:

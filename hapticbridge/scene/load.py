@@ -326,7 +326,7 @@ def compile_scene(
             changes, model = changes + excluded, spec.compile()
         concerns = [*source.concerns, *about_grip]
         for each in dict.fromkeys(grips):
-            concerns += check_model(model, each)
+            check_model(model, each)
         for each in dict.fromkeys(grips):
             replaced, holding = take_over_mocap(spec, model, each, as_is=as_is)
             changes, concerns = changes + replaced, [*concerns, *holding]
