@@ -23,7 +23,6 @@ from hapticbridge.scene.checks import (
 )
 from hapticbridge.scene.compile import (
     START_KEYFRAME,
-    SceneChange,
     clause,
     find_start,
     hold_servos,
@@ -42,6 +41,7 @@ from hapticbridge.scene.parameters import apply_parameters
 from hapticbridge.scene.scene import Scene
 from hapticbridge.scene.source import SourceFile, collect_sources
 from hapticbridge.scene.start import start_on_constraints
+from hapticbridge.scene.treatment import SceneChange
 from hapticbridge.units import format_si
 
 # Shipped scenes, by name
@@ -299,7 +299,7 @@ def compile_scene(
             before, spec.memory, spec.nstack, spec.njmax = model.narena, -1, -1, -1
             model = spec.compile()
             sizes = (format_si(size, "B") for size in (before, model.narena))
-            changes += (SceneChange(f"memory: {' → '.join(sizes)}"),)
+            changes += (SceneChange(f"memory: {' → '.join(sizes)}", "memory"),)
         if not as_is and (excluded := exclude_nested(spec, model, grips[0])):
             changes, model = changes + excluded, spec.compile()
         concerns = [*source.concerns, *about_grip]
@@ -312,8 +312,18 @@ def compile_scene(
         changes, concerns = changes + started, [*concerns, *remaining]
         seat_handle(model, grips[0])
         data, values = mujoco.MjData(model), dict(source.parameters)
+        is_exact = source.spec.option.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT
         scene = Scene(
-            path, grips[0], model, data, source.sources, values, changes, as_is, _spec=spec
+            path,
+            grips[0],
+            model,
+            data,
+            source.sources,
+            values,
+            changes,
+            as_is,
+            _spec=spec,
+            _has_approximate_diagonal=not is_exact,
         )
         scene.other_grips = grips[1:]
         scene.reset()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -30,8 +31,7 @@ from hapticbridge.kernel.rigid_contact import (
     largest_margin,
     rigid_margins,
 )
-from hapticbridge.scene.compile import SceneChange, clause, go_to_start
-from hapticbridge.scene.contacts import announce_rigid
+from hapticbridge.scene.compile import clause, go_to_start
 from hapticbridge.scene.handle import (
     add_weld,
     carry_over,
@@ -39,7 +39,10 @@ from hapticbridge.scene.handle import (
     set_weld_gains,
     tied_trees,
 )
+from hapticbridge.scene.softness import announce_rigid
 from hapticbridge.scene.source import SourceFile
+from hapticbridge.scene.treatment import SceneChange
+from hapticbridge.units import format_si
 
 _MARGINS = ("geom_margin", "pair_margin", "flex_margin")
 _GAPS = ("geom_gap", "pair_gap", "flex_gap")
@@ -118,6 +121,7 @@ class Scene:
     findings: tuple[str, ...] = ()
 
     _spec: mujoco.MjSpec | None = None
+    _has_approximate_diagonal: bool = False
     _is_claimed: bool = False
     _reach: float = 0.0
     _period: float = 0.0
@@ -208,7 +212,16 @@ class Scene:
             raise SceneError(f"period is {scene_period!r} s; it must be finite and > 0")
         if substeps < 1:
             raise SceneError(f"substeps is {substeps}; it must be 1 or more")
-        self.model.opt.timestep, self._period = scene_period / substeps, scene_period
+        step = self.model.opt.timestep = scene_period / substeps
+        self._period = scene_period
+        own = self._spec.option.timestep if self._spec else step
+        words = f"timestep: {format_si(own, 's')} → {format_si(step, 's')}"
+        self._announce("time step", "" if math.isclose(own, step) else words)
+
+    def _announce(self, subject: str, words: str) -> None:
+        """Replaces the change on a subject; empty words remove it."""
+        others = tuple(each for each in self.differences if each.subject != subject)
+        self.differences = ((SceneChange(words, subject),) if words else ()) + others
 
     def set_reach(self, distance: float) -> None:
         """Lets MuJoCo detect contacts, without a force, from a distance in m before they touch.
@@ -222,6 +235,12 @@ class Scene:
         self.model.pair_gap += more
         self.model.flex_gap += more
         self._set_margins()
+        if self.model.flg_adhesion:
+            # each of two geoms has it
+            words = (
+                f"adhesion: from the file's gap on → from {format_si(2 * distance, 'm')} before it"
+            )
+            self._announce("adhesion", words if distance else "")
 
     def set_contact(self, *, is_rigid: bool) -> None:
         """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
@@ -231,17 +250,20 @@ class Scene:
         the solver no laxer than MuJoCo's own, and the points of ``kernel.colliders``.
         """
         model, own = self.model, self._own_contact
+        is_said = not is_rigid and self._has_approximate_diagonal
+        self._announce("diagonal", "flag diagexact: disable → enable" if is_said else "")
         if is_rigid == bool(own):
             self._set_margins()
             return
-        said = announce_rigid(model)
-        self.differences = tuple(each for each in self.differences if each not in said)
         if not is_rigid:
+            self.differences = tuple(
+                each for each in self.differences if not each.treatment.is_rigid
+            )
             self._restore_contact(model)
             self._own_contact = {}
             return
-        self.differences = said + self.differences
         needed = _rigid_options(model.opt)
+        self.differences = announce_rigid(model, needed) + self.differences
         own = {name: getattr(model.opt, name) for name in needed}
         own |= {name: getattr(model, name).copy() for name in (*_MARGINS, *_LIMIT_MARGINS)}
         own |= {name: getattr(model, name) - self._reach for name in _GAPS}
@@ -311,7 +333,7 @@ class Scene:
         self.is_carried, words = True, "weight of the tool: felt → carried"
         if loads := hanging_loads(model, trees):
             words += f", but not that of {choices(loads)} on its tendons"
-        self.differences += (SceneChange(words, reason=reason),)
+        self.differences += (SceneChange(words, "weight", reason),)
         self.reset()
 
     def _recompile(self, spec: mujoco.MjSpec) -> None:
