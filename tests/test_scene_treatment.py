@@ -14,7 +14,7 @@ import hapticbridge as hb
 from hapticbridge.cli.guide import page
 from hapticbridge.scene.treatment import TREATMENTS, treatment_table
 
-SCHEMA = Path(__file__).parent / "golden" / "mjcf_schema.txt"
+SCHEMA = Path(__file__).with_name("mjcf_schema.txt")
 """Elements of MJCF, each with its attributes, when the table was last compared with them."""
 
 
