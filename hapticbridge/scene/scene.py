@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ from hapticbridge.scene.handle import (
 )
 from hapticbridge.scene.softness import announce_rigid
 from hapticbridge.scene.source import SourceFile
-from hapticbridge.scene.treatment import SceneChange
+from hapticbridge.scene.treatment import TREATMENTS, SceneChange
 from hapticbridge.units import format_si
 
 _MARGINS = ("geom_margin", "pair_margin", "flex_margin")
@@ -51,6 +52,15 @@ _PRECISE = {"iterations": 100, "ls_iterations": 50, "tolerance": 1e-8, "ls_toler
 """MuJoCo's own limits of its solver. Where a file's are laxer, the solver may stop so early that
 the energy of contacts cannot be computed from its forces: with ``ls_iterations`` 10, three boxes
 under a plate created 1.3 J."""
+
+
+_RIGID = [subject for subject, treatment in TREATMENTS.items() if treatment.is_rigid]
+_OF_RUN = ("time step", "diagonal", "adhesion", *_RIGID)
+"""Subjects of changes that a run's settings make, and not the loading of the scene."""
+
+
+def _place(change: SceneChange) -> int:
+    return _OF_RUN.index(change.subject)
 
 
 def _rigid_options(option: mujoco.MjOption) -> dict[str, Any]:
@@ -216,12 +226,19 @@ class Scene:
         self._period = scene_period
         own = self._spec.option.timestep if self._spec else step
         words = f"timestep: {format_si(own, 's')} → {format_si(step, 's')}"
-        self._announce("time step", "" if math.isclose(own, step) else words)
+        self._announce(["time step"], [] if math.isclose(own, step) else [words])
 
-    def _announce(self, subject: str, words: str) -> None:
-        """Replaces the change on a subject; empty words remove it."""
-        others = tuple(each for each in self.differences if each.subject != subject)
-        self.differences = ((SceneChange(words, subject),) if words else ()) + others
+    def _announce(self, subjects: Collection[str], words: Iterable[str | SceneChange]) -> None:
+        """Replaces the changes on some subjects, of which words belong to the first.
+
+        The changes of a run's settings come first, in the order of the table, so that a run and its
+        audit list them alike.
+        """
+        new = [SceneChange(each, *subjects) if isinstance(each, str) else each for each in words]
+        of_run = [each for each in self.differences if each.subject in _OF_RUN]
+        of_file = [each for each in self.differences if each.subject not in _OF_RUN]
+        kept = [each for each in of_run if each.subject not in subjects]
+        self.differences = (*sorted([*kept, *new], key=_place), *of_file)
 
     def set_reach(self, distance: float) -> None:
         """Lets MuJoCo detect contacts, without a force, from a distance in m before they touch.
@@ -240,7 +257,7 @@ class Scene:
             words = (
                 f"adhesion: from the file's gap on → from {format_si(2 * distance, 'm')} before it"
             )
-            self._announce("adhesion", words if distance else "")
+            self._announce(["adhesion"], [words] if distance else [])
 
     def set_contact(self, *, is_rigid: bool) -> None:
         """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
@@ -251,19 +268,17 @@ class Scene:
         """
         model, own = self.model, self._own_contact
         is_said = not is_rigid and self._has_approximate_diagonal
-        self._announce("diagonal", "flag diagexact: disable → enable" if is_said else "")
+        self._announce(["diagonal"], ["flag diagexact: disable → enable"] if is_said else [])
         if is_rigid == bool(own):
             self._set_margins()
             return
         if not is_rigid:
-            self.differences = tuple(
-                each for each in self.differences if not each.treatment.is_rigid
-            )
+            self._announce(_RIGID, [])
             self._restore_contact(model)
             self._own_contact = {}
             return
         needed = _rigid_options(model.opt)
-        self.differences = announce_rigid(model, needed) + self.differences
+        self._announce(_RIGID, announce_rigid(model, needed))
         own = {name: getattr(model.opt, name) for name in needed}
         own |= {name: getattr(model, name).copy() for name in (*_MARGINS, *_LIMIT_MARGINS)}
         own |= {name: getattr(model, name) - self._reach for name in _GAPS}
