@@ -218,6 +218,7 @@ def spec_source(spec: mujoco.MjSpec) -> SceneSource:
     """
     path = Path(spec.modelfiledir) / f"{spec.modelname or 'scene'}.xml"
     spec = spec.copy()
+    _name_folders(spec)
     with _refused(path):
         sources = collect_sources(path, spec.to_xml().encode())
     known = {source.name for source in sources}
@@ -227,6 +228,27 @@ def spec_source(spec: mujoco.MjSpec) -> SceneSource:
     sources += tuple(SourceFile(name, held[name]) for name in sorted(held.keys() - known))
     check_numbers(sources)
     return SceneSource(path, spec, sources, {}, tuple(check_options(spec)))
+
+
+def _name_folders(spec: mujoco.MjSpec) -> None:
+    """Writes the whole path of each asset of a part that was attached from another folder.
+
+    MuJoCo finds such a file beside the part, but writes its name alone.
+    """
+    with suppress(ValueError, mujoco.FatalError):  # the compilation of the scene gives the reason
+        model = spec.compile()
+        for elements, places, folder in (
+            (spec.meshes, model.mesh_pathadr, spec.meshdir),
+            (spec.hfields, model.hfield_pathadr, spec.meshdir),
+            (spec.textures, model.tex_pathadr, spec.texturedir),
+            (spec.skins, model.skin_pathadr, spec.meshdir),
+        ):
+            for element in elements:
+                start = int(places[element.id])
+                found = Path(model.paths[start:].partition(b"\0")[0].decode())
+                own = Path(spec.modelfiledir, folder, element.file)
+                if start >= 0 and found.is_file() and found.absolute() != own.absolute():
+                    element.file = str(found.absolute())
 
 
 def _written(source: SceneSource) -> SceneSource:
