@@ -187,9 +187,9 @@ class _Home:
         for (start, stop), name, inner in self._outer_names(text, depth, root):
             if start < end:
                 continue
-            if not inner or _leads_out(inner, depth):
-                inner = _parts(name)[-1].rpartition(":")[-1]
-            pieces += [text[end:start], escape(inner)]
+            is_found = inner and not _leads_out(inner, depth)
+            last = _parts(name)[-1].rpartition(":")[-1]
+            pieces += [text[end:start], escape(inner if is_found else last)]
             end = stop
         return "".join((*pieces, text[end:])).encode("utf-8", errors="surrogateescape")
 
