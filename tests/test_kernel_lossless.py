@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import prepare, unguarded_parameters
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.trajectory import pose_at, read_motion
+from hapticbridge.device.motion_file import read_motion
+from hapticbridge.device.trajectory import pose_at
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.lossless import evaluate_tool_passive, write_tool_bias

@@ -438,7 +438,8 @@ def test_edges_of_a_flex_are_constraints_where_discrete_has_no_springs(
 ) -> None:
     path = scene_file(tmp_path, mjcf("<option integrator='discrete'/>", world=ROPE.format(edge)))
     scene, heights, environment = still_run(path)
-    assert scene.changes == ((f"edges of flex 'rope': {change}",) if change else ())
+    said = [each for each in scene.changes if each.startswith("edges of")]
+    assert said == ([f"edges of flex 'rope': {change}"] if change else [])
     assert (environment, heights.min() > -0.05) == ("strict", True)
     lengths = np.linalg.norm(np.diff(scene.data.flexvert_xpos, axis=0), axis=1)
     assert lengths == pytest.approx(0.02, rel=0.2)  # MuJoCo's constraints are soft

@@ -480,3 +480,39 @@ def test_a_scene_that_compiles_too_long_or_takes_too_much_ends_in_a_sentence(
         )
         assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stderr
         assert words in " ".join(done.stderr.split())
+
+
+def attached_spec(folder: Path) -> mujoco.MjSpec:
+    """Returns a scene with two parts from folders of their own, whose meshes have one name."""
+    for name, size in (("main", 1.0), ("left", 2.0), ("right", 3.0)):
+        (folder / name / "meshes").mkdir(parents=True)
+        (folder / name / "meshes" / "part.obj").write_bytes(obj_bytes(size))
+        (folder / name / f"{name}.xml").write_text(
+            f"<mujoco model='{name}'><compiler meshdir='meshes'/>"
+            "<asset><mesh name='part' file='part.obj'/></asset><worldbody>"
+            f"<body name='{name}'><geom type='mesh' mesh='part'/><site name='grip'/></body>"
+            "</worldbody></mujoco>"
+        )
+    whole, *parts = (
+        mujoco.MjSpec.from_file(str(folder / name / f"{name}.xml"))
+        for name in ("main", "left", "right")
+    )
+    for place, part in enumerate(parts):
+        frame = whole.worldbody.add_frame(pos=[0, 0, 1 + place])
+        whole.attach(part, prefix=f"{part.modelname}_", frame=frame)
+        whole.body(f"{part.modelname}_{part.modelname}").add_freejoint()
+    return whole
+
+
+def test_parts_of_a_specification_keep_the_assets_of_their_own_folders(tmp_path: Path) -> None:
+    whole = attached_spec(tmp_path)
+    scene, own = load_scene(whole, grip="left_grip"), whole.copy().compile()
+    assert [mesh.file for mesh in whole.meshes] == ["part.obj"] * 3  # left alone
+    assert np.array_equal(scene.model.mesh_vert, own.mesh_vert)
+    assert len({mesh.tobytes() for mesh in np.split(own.mesh_vert, 3)}) == 3
+    names = [source.name.partition("/")[2] for source in scene.sources]
+    assert names[0] == "main/main.xml"  # in the folder above, so that it may climb out of two
+    assert set(names[1:]) == {f"{name}/meshes/part.obj" for name in ("main", "left", "right")}
+    file = tmp_path / "run.mcap"
+    recorded(file, scene, duration=0.05)
+    assert audit(file).resimulation == "bit for bit"

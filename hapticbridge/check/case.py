@@ -19,6 +19,7 @@ from hapticbridge.demand.methods import RIGID, default_method
 from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice, read_motion
 from hapticbridge.device.base import checked_number
+from hapticbridge.device.motion_file import is_bag, read_bag
 from hapticbridge.device.trajectory import DEFAULT_SECONDS, lissajous
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.kernel.mujoco_c import quiet
@@ -51,6 +52,8 @@ def motion_for(scene: Scene, path: str | Path | None = None) -> Motion | None:
         return read_motion(beside).relative() if beside.is_file() else None
     if Path(path).suffix != RECORDING:
         return read_motion(path).relative()
+    if is_bag(Path(path)):
+        return read_bag(Path(path)).relative()
     recording = read_recording(path)
     ticks = recording.ticks
     try:

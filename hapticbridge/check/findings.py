@@ -39,8 +39,8 @@ _SAME_STEP = 1e-9  # relative: 0.001 as 1/1000
 def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields a time step that is not the run's, and concerns from loading the scene.
 
-    Integrator, solver and flags that a run needs are set when the scene is loaded
-    (``Scene.differences``), so that they are no faults.
+    Integrator and solver are replaced without harm, so that they are no faults. Time step and start
+    have faults of their own.
     """
     option, places = case.source.spec.option, case.places
     step = float(option.timestep)
@@ -54,11 +54,11 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             f"{1 / step:g}",
         )
     for change in case.scene.differences:
-        if not change.kind:  # those of a kind have a fault of their own
+        if change.subject not in ("time step", "integrator", "solver", "overlap"):
             yield Fault(
                 "changed",
                 places.option("integrator"),
-                f"the scene runs with a change, {change}",
+                f"the scene runs with a change, {change}, because {change.treatment.why}",
                 "run --as-is, which refuses the scene",
             )
     place = places.with_attribute("wind") or places.option("wind")

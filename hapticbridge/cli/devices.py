@@ -74,7 +74,7 @@ IDENTIFY, RUN = "hapticbridge identify", "hapticbridge run peg_in_hole --device"
 
 _WITHOUT_HARDWARE = (
     ("simulated", "a simulated device in the scene's own hand; the default"),
-    ("trajectory", "trajectory:FILE follows a CSV file, or repeats the motion of a recording"),
+    ("trajectory", "trajectory:FILE follows a CSV file or a bag of poses, or repeats a recording"),
 )
 
 

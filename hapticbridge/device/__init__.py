@@ -11,6 +11,7 @@ from hapticbridge.device.base import AXES as AXES
 from hapticbridge.device.base import DATA_SHEET_UNITS as DATA_SHEET_UNITS
 from hapticbridge.device.base import Device as Device
 from hapticbridge.device.base import DeviceInfo as DeviceInfo
+from hapticbridge.device.motion_file import read_motion as read_motion
 from hapticbridge.device.registry import device_for as device_for
 from hapticbridge.device.registry import open_device as open_device
 from hapticbridge.device.simulated.device import GrippingDevice as GrippingDevice
@@ -21,4 +22,3 @@ from hapticbridge.device.simulated.dynamics import Hand as Hand
 from hapticbridge.device.trajectory import Motion as Motion
 from hapticbridge.device.trajectory import ReplayDevice as ReplayDevice
 from hapticbridge.device.trajectory import TrajectoryDevice as TrajectoryDevice
-from hapticbridge.device.trajectory import read_motion as read_motion

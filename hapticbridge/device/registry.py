@@ -28,6 +28,7 @@ from typing import Any
 
 from hapticbridge.device.base import Device, DeviceInfo, calling_on_error, checked_close, telling
 from hapticbridge.device.driver import Driver, FoundDevice, Notify, Options, ignore_message
+from hapticbridge.device.motion_file import is_bag, read_bag, read_motion
 from hapticbridge.device.profile import modelled, profile_named, profile_of
 from hapticbridge.device.simulated.device import (
     GrippingDevice,
@@ -36,7 +37,7 @@ from hapticbridge.device.simulated.device import (
     scene_hand,
 )
 from hapticbridge.device.simulated.dynamics import Hand
-from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice, read_motion
+from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
 from hapticbridge.errors import DeviceError, choices, nearest
 from hapticbridge.kernel.codes import Grip
 from hapticbridge.scene import Scene
@@ -252,8 +253,9 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
       change its hand, ``hand=none`` removes it. ``stated_damping``, ``stated_delay`` in s,
       ``stated_friction`` and ``stated_resolution`` are what its data sheet says, or ``unknown``, in
       place of the truth. ``path=FILE`` must be last: all text after it is the file's name.
-    - ``trajectory:FILE``: follows a CSV file (``read_motion``) or repeats the device motion of a
-      recording. All text after the colon is the file's name, with commas and colons.
+    - ``trajectory:FILE``: follows a CSV file (``read_motion``), or a bag of ROS 2 in MCAP, or
+      repeats the device motion of a recording. All text after the colon is the file's name, with
+      commas and colons; of a bag with several poses, ``FILE:/TOPIC``.
     - ``mouse``: a handle that is dragged in the view, ``mouse:speed=0.5``.
     - a connected device, by the name of its driver (``hapticbridge devices`` lists them), with
       options of that driver: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
@@ -416,7 +418,9 @@ def _open_trajectory(rest: str, options: Mapping[str, object]) -> Device:
     limits: dict[str, Any] = dict(options)
     if not rest:
         raise DeviceError("trajectory needs a file: 'trajectory:FILE', a CSV file or a recording")
-    path = Path(rest)
+    path, topic = _named_topic(rest)
+    if topic or (_is_recording(path) and is_bag(path)):
+        return TrajectoryDevice(read_bag(path, topic), **limits)
     if not _is_recording(path):
         return TrajectoryDevice(read_motion(path), **limits)
     # imported here, because the package device must not depend on recordings; only the replay of a
@@ -437,6 +441,18 @@ _OPENERS: dict[str, Callable[[str, Mapping[str, object]], Device]] = {
     "simulated": _open_simulated,
     "trajectory": _open_trajectory,
 }
+
+
+def _named_topic(text: str) -> tuple[Path, str]:
+    """Returns file and topic of ``FILE:/TOPIC``, or a folder's one bag; the topic may be empty."""
+    file, colon, topic = text.partition(":/")
+    try:
+        is_named = bool(colon) and not Path(text).exists() and Path(file).exists()
+        path = Path(file if is_named else text)
+        bags = sorted(path.glob("*.mcap")) if path.is_dir() else []
+    except (OSError, ValueError):  # reading it as a motion then reports the reason
+        return Path(text), ""
+    return bags[0] if len(bags) == 1 else path, f"/{topic}" if is_named else ""
 
 
 def _is_recording(path: Path) -> bool:

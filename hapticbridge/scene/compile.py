@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from typing import Literal, NamedTuple
 
 import mujoco
 import numpy as np
 
 from hapticbridge.kernel.codes import coupling_ids, handle_ids
 from hapticbridge.kernel.mujoco_c import quiet
+from hapticbridge.scene.treatment import SceneChange
 
 # Custom texts and numbers of a scene (``<custom>`` in MJCF), by name
 
@@ -98,23 +98,6 @@ def seat_handle(model: mujoco.MjModel, grip: str) -> None:
             model.key_mquat[key].reshape(-1, 4)[mocap_id] = data.site_xquat[site_id]
 
 
-class SceneChange(NamedTuple):
-    """Difference of a running scene from its file.
-
-    Attributes:
-        words: The change as ``name: old → new``.
-        kind: Changed setting, where a rule of ``hapticbridge check`` examines it; empty elsewhere.
-        reason: Cause in the run, of a change that the scene alone does not determine; else empty.
-    """
-
-    words: str
-    kind: Literal["", "integrator", "solver", "start"] = ""
-    reason: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.words} ({self.reason})" if self.reason else self.words
-
-
 def hold_servos(model: mujoco.MjModel) -> tuple[SceneChange, ...]:
     """Aims the position servos at their pose in keyframe ``home`` if this has no controls.
 
@@ -142,7 +125,8 @@ def hold_servos(model: mujoco.MjModel) -> tuple[SceneChange, ...]:
     count = f"{len(moved)} servo{'s' if len(moved) > 1 else ''}"
     if not moved:
         return ()
-    return (SceneChange(f"ctrl of {count} in keyframe '{START_KEYFRAME}': 0 → its pose"),)
+    words = f"ctrl of {count} in keyframe '{START_KEYFRAME}': 0 → its pose"
+    return (SceneChange(words, "servos"),)
 
 
 def _is_servo(model: mujoco.MjModel, actuator: int) -> bool:

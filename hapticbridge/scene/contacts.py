@@ -49,7 +49,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import SceneError, SceneWarning
-from hapticbridge.scene.compile import SceneChange
 
 STRICT_STEPS = 60.0
 """τ/h above which a contact of moderate stiffness created no energy in any run of the map (its
@@ -174,77 +173,6 @@ def contact_numbers(
         resolved = max(resolved, 1.0)
     stiffness = impedance / (1 - impedance) / resolved**2
     return ContactNumbers(resolved, 2 * last * resolved * ratio, stiffness, impedance)
-
-
-SOFT_FREQUENCY = 15.0
-"""Natural frequency in Hz below which an equality constraint is meant as a spring. MuJoCo's default
-holds at 24 Hz. A hand moves at up to 10 Hz, and would feel a softer one yield."""
-
-
-def announce_rigid(model: mujoco.MjModel) -> tuple[SceneChange, ...]:
-    """Returns what rigid contacts and constraints change, each as ``name: old → new``."""
-    changes = _soft_equalities(model)
-    touches = (model.geom_contype | model.geom_conaffinity) != 0
-    bounces = np.array([restitution(each) for each in model.geom_solref]) * touches
-    others = np.count_nonzero(bounces >= NOTABLE_BOUNCE) - 1
-    if others >= 0:
-        name = geom_name(model, int(bounces.argmax()))
-        named = f"{name} and {others} more" if others else name
-        words = f"bounce of {named}: e = {bounces.max():.2g} → 0 (--contact scene keeps it)"
-        changes += (SceneChange(words),)
-    return changes
-
-
-NOTABLE_BOUNCE = 0.2
-"""Coefficient of restitution below which a rigid contact is not said to differ from the file's.
-Bodies in default contact bounce with 0.14."""
-
-
-def restitution(solref: Sequence[float]) -> float:
-    """Returns MuJoCo's coefficient of restitution of a contact, from 0 to 1.
-
-    A spring and damper that only push let go where their force is zero, before the spring is at
-    rest: e = exp(−ζ φ/s) with s = √(1 − ζ²), φ = atan2(2ζs, 2ζ² − 1); for ζ > 1 with s = √(ζ² − 1),
-    φ = artanh(2ζs/(2ζ² − 1)). Critical damping, MuJoCo's default, has e = exp(−2) = 0.14.
-
-    Args:
-        solref: MuJoCo's (time constant in s, damping ratio ζ), or (−k, −b) with ζ = b/(2√k).
-    """
-    first, second = float(solref[0]), float(solref[1])
-    ratio = second if first > 0.0 else -second / (2.0 * math.sqrt(-first)) if first else 1.0
-    ratio = max(ratio, 0.0)
-    root = math.sqrt(abs(1.0 - ratio**2))
-    if root < 1e-6:
-        return math.exp(-2.0)
-    twice, rest = 2.0 * ratio * root, 2.0 * ratio**2 - 1.0
-    angle = math.atan2(twice, rest) if ratio < 1.0 else math.atanh(twice / rest)
-    return math.exp(-ratio / root * angle)
-
-
-def _soft_equalities(model: mujoco.MjModel) -> tuple[SceneChange, ...]:
-    """Returns a sentence on equality constraints that rigid ones replace, as ``name: old → new``.
-
-    An equality holds a mass with ω² = κ/h² (κ of the module's first equation), so softly below
-    ``SOFT_FREQUENCY``. MuJoCo's spring follows the inertia and its energy is in no account: of
-    14 settings, 8 were active after a stretch of 5 mm at the start (45 nJ to 10 mJ), and one at
-    rest was not strict (8.7 mJ, within slack).
-    """
-    step, names, slowest = float(model.opt.timestep), [], math.inf
-    for i in np.flatnonzero(model.eq_type <= int(mujoco.mjtEq.mjEQ_TENDON)).tolist():
-        solref, solimp = _floats(model.eq_solref[i]), _floats(model.eq_solimp[i])
-        numbers = contact_numbers(solref, solimp, step, refsafe=False)
-        frequency = math.sqrt(numbers.stiffness) / (2.0 * math.pi * step)
-        if frequency < SOFT_FREQUENCY:
-            names.append(model.equality(i).name or str(i))
-            slowest = min(slowest, frequency)
-    if not names:
-        return ()
-    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-    words = (
-        f"equality '{names[0]}'{more}: a spring of {slowest:.2g} Hz → rigid (--contact scene keeps "
-        "it, and may then create energy)"
-    )
-    return (SceneChange(words),)
 
 
 def impedance_at(solimp: Sequence[float], depth: float) -> float:

@@ -38,7 +38,8 @@ from hapticbridge.scene.checks import (
     listed,
     overlaps,
 )
-from hapticbridge.scene.compile import SceneChange, go_to_start
+from hapticbridge.scene.compile import go_to_start
+from hapticbridge.scene.treatment import SceneChange
 
 # Weld between grip and handle (MuJoCo's equality constraint)
 
@@ -297,10 +298,10 @@ def set_options(spec: mujoco.MjSpec, *, as_is: bool = False) -> tuple[SceneChang
         changes.append(SceneChange(f"solver: {_SOLVERS[solver]} → Newton", "solver"))
         needed += changes if solver == mujoco.mjtSolver.mjSOL_PGS else []
     if option.noslip_iterations > 0:
-        needed.append(SceneChange(f"noslip_iterations: {option.noslip_iterations} → 0"))
+        needed.append(SceneChange(f"noslip_iterations: {option.noslip_iterations} → 0", "noslip"))
     if option.enableflags & enable.mjENBL_SLEEP:
-        needed.append(SceneChange("flag sleep: enable → disable"))
-    needed += map(SceneChange, _constrain_edges(spec, as_is=as_is))
+        needed.append(SceneChange("flag sleep: enable → disable", "sleep"))
+    needed += _constrain_edges(spec, as_is=as_is)
     if needed and as_is:
         raise SceneError(
             f"the scene needs other options to be coupled ({', '.join(map(str, needed))}); "
@@ -328,7 +329,7 @@ def set_options(spec: mujoco.MjSpec, *, as_is: bool = False) -> tuple[SceneChang
     return tuple(dict.fromkeys((*changes, *needed)))
 
 
-def _constrain_edges(spec: mujoco.MjSpec, *, as_is: bool) -> list[str]:
+def _constrain_edges(spec: mujoco.MjSpec, *, as_is: bool) -> list[SceneChange]:
     """Replaces springs and dampers on a flex's edges, which ``discrete`` lacks, by constraints.
 
     Returns:
@@ -338,11 +339,12 @@ def _constrain_edges(spec: mujoco.MjSpec, *, as_is: bool) -> list[str]:
     changes = []
     for flex in spec.flexes:
         if flex.edgestiffness > 0:
-            changes.append(f"edges of flex '{flex.name}': springs → constraints of constant length")
+            words = "springs → constraints of constant length"
         elif flex.edgedamping > 0:
-            changes.append(f"edges of flex '{flex.name}': damping {flex.edgedamping:g} → 0")
+            words = f"damping {flex.edgedamping:g} → 0"
         else:
             continue
+        changes.append(SceneChange(f"edges of flex '{flex.name}': {words}", "edges"))
         if as_is:
             continue
         if flex.edgestiffness > 0 and flex.name not in constrained:
@@ -408,7 +410,7 @@ def limit_motors_alone(
             model.actuator_forcerange[actuator] = low, high
     each = "each of its actuators" if shared else "its actuator"
     words = f"force limit of joint '{name}'{more}: on all actuators together → on {each}"
-    return (SceneChange(words),)
+    return (SceneChange(words, "joint's force limit"),)
 
 
 HELD = 1e-6
@@ -466,7 +468,8 @@ def take_over_mocap(
     for i in held:
         model.eq_active0[i] = 0
         next(equality for equality in spec.equalities if equality.id == i).active = False
-    return (SceneChange(f"grip held by mocap body '{name}'{more} → by the hand alone"),), []
+    words = f"grip held by mocap body '{name}'{more} → by the hand alone"
+    return (SceneChange(words, "mocap weld"),), []
 
 
 def tied_trees(model: mujoco.MjModel, tree: int) -> list[int]:
@@ -581,7 +584,7 @@ def exclude_nested(
             bodies[body_id].name = bodies[body_id].name or f"{PREFIX}body_{body_id}"
         spec.add_exclude(bodyname1=bodies[first].name, bodyname2=bodies[second].name)
     where = listed(list(pairs.values()))
-    return (SceneChange(f"contact where {where} at the start: on → off"),)
+    return (SceneChange(f"contact where {where} at the start: on → off", "nested parts"),)
 
 
 def announce_overlaps(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[SceneChange, ...]:
@@ -591,5 +594,5 @@ def announce_overlaps(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Scene
             f"start where {listed(overlapping)}: pushed out at once → held, and eased out with "
             "energy that the scene has dissipated"
         )
-        return (SceneChange(words, "start"),)
+        return (SceneChange(words, "overlap"),)
     return ()

@@ -23,7 +23,6 @@ from hapticbridge.scene.checks import (
 )
 from hapticbridge.scene.compile import (
     START_KEYFRAME,
-    SceneChange,
     clause,
     find_start,
     hold_servos,
@@ -42,6 +41,7 @@ from hapticbridge.scene.parameters import apply_parameters
 from hapticbridge.scene.scene import Scene
 from hapticbridge.scene.source import SourceFile, collect_sources
 from hapticbridge.scene.start import start_on_constraints
+from hapticbridge.scene.treatment import SceneChange
 from hapticbridge.units import format_si
 
 # Shipped scenes, by name
@@ -218,6 +218,7 @@ def spec_source(spec: mujoco.MjSpec) -> SceneSource:
     """
     path = Path(spec.modelfiledir) / f"{spec.modelname or 'scene'}.xml"
     spec = spec.copy()
+    _name_folders(spec)
     with _refused(path):
         sources = collect_sources(path, spec.to_xml().encode())
     known = {source.name for source in sources}
@@ -227,6 +228,27 @@ def spec_source(spec: mujoco.MjSpec) -> SceneSource:
     sources += tuple(SourceFile(name, held[name]) for name in sorted(held.keys() - known))
     check_numbers(sources)
     return SceneSource(path, spec, sources, {}, tuple(check_options(spec)))
+
+
+def _name_folders(spec: mujoco.MjSpec) -> None:
+    """Writes the whole path of each asset of a part that was attached from another folder.
+
+    MuJoCo finds such a file beside the part, but writes its name alone.
+    """
+    with suppress(ValueError, mujoco.FatalError):  # the compilation of the scene gives the reason
+        model = spec.compile()
+        for elements, places, folder in (
+            (spec.meshes, model.mesh_pathadr, spec.meshdir),
+            (spec.hfields, model.hfield_pathadr, spec.meshdir),
+            (spec.textures, model.tex_pathadr, spec.texturedir),
+            (spec.skins, model.skin_pathadr, spec.meshdir),
+        ):
+            for element in elements:
+                start = int(places[element.id])
+                found = Path(model.paths[start:].partition(b"\0")[0].decode())
+                own = Path(spec.modelfiledir, folder, element.file)
+                if start >= 0 and found.is_file() and found.absolute() != own.absolute():
+                    element.file = str(found.absolute())
 
 
 def _written(source: SceneSource) -> SceneSource:
@@ -259,7 +281,7 @@ def _compiled(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, tuple[SceneChange, .
     if before > MAX_MEMORY or rows > MAX_ROWS:  # before MuJoCo itself reserves it to compile
         spec.memory, spec.nstack, spec.njmax, spec.nconmax = MAX_MEMORY, -1, -1, -1
         asked = format_si(before, "B") if before > MAX_MEMORY else f"for {rows} rows"
-        change = SceneChange(f"memory: {asked} → {format_si(MAX_MEMORY, 'B')}")
+        change = SceneChange(f"memory: {asked} → {format_si(MAX_MEMORY, 'B')}", "memory")
         return spec.compile(), (change,)
     model = spec.compile()
     if model.narena >= MIN_MEMORY:
@@ -267,7 +289,7 @@ def _compiled(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, tuple[SceneChange, .
     before, spec.memory, spec.nstack, spec.njmax = model.narena, -1, -1, -1
     model = spec.compile()
     sizes = (format_si(size, "B") for size in (before, model.narena))
-    return model, (SceneChange(f"memory: {' → '.join(sizes)}"),)
+    return model, (SceneChange(f"memory: {' → '.join(sizes)}", "memory"),)
 
 
 MIN_MEMORY = 13 << 20

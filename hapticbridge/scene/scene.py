@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import math
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -31,8 +33,7 @@ from hapticbridge.kernel.rigid_contact import (
     largest_margin,
     rigid_margins,
 )
-from hapticbridge.scene.compile import SceneChange, clause, go_to_start
-from hapticbridge.scene.contacts import announce_rigid
+from hapticbridge.scene.compile import clause, go_to_start
 from hapticbridge.scene.handle import (
     add_weld,
     carry_over,
@@ -40,7 +41,10 @@ from hapticbridge.scene.handle import (
     set_weld_gains,
     tied_trees,
 )
+from hapticbridge.scene.softness import announce_rigid
 from hapticbridge.scene.source import SourceFile
+from hapticbridge.scene.treatment import TREATMENTS, SceneChange
+from hapticbridge.units import format_si
 
 _MARGINS = ("geom_margin", "pair_margin", "flex_margin")
 _GAPS = ("geom_gap", "pair_gap", "flex_gap")
@@ -49,6 +53,15 @@ _PRECISE = {"iterations": 100, "ls_iterations": 50, "tolerance": 1e-8, "ls_toler
 """MuJoCo's own limits of its solver. Where a file's are laxer, the solver may stop so early that
 the energy of contacts cannot be computed from its forces: with ``ls_iterations`` 10, three boxes
 under a plate created 1.3 J."""
+
+
+_RIGID = [subject for subject, treatment in TREATMENTS.items() if treatment.is_rigid]
+_OF_RUN = ("time step", "adhesion", *_RIGID)
+"""Subjects of changes that a run's settings make, and not the loading of the scene."""
+
+
+def _place(change: SceneChange) -> int:
+    return _OF_RUN.index(change.subject)
 
 
 def _rigid_options(option: mujoco.MjOption) -> dict[str, Any]:
@@ -210,7 +223,23 @@ class Scene:
             raise SceneError(f"period is {scene_period!r} s; it must be finite and > 0")
         if substeps < 1:
             raise SceneError(f"substeps is {substeps}; it must be 1 or more")
-        self.model.opt.timestep, self._period = scene_period / substeps, scene_period
+        step = self.model.opt.timestep = scene_period / substeps
+        self._period = scene_period
+        own = self._spec.option.timestep if self._spec else step
+        words = f"timestep: {format_si(own, 's')} → {format_si(step, 's')}"
+        self._announce(["time step"], [] if math.isclose(own, step) else [words])
+
+    def _announce(self, subjects: Collection[str], words: Iterable[str | SceneChange]) -> None:
+        """Replaces the changes on some subjects, of which words belong to the first.
+
+        The changes of a run's settings come first, in the order of the table, so that a run and its
+        audit list them alike.
+        """
+        new = [SceneChange(each, *subjects) if isinstance(each, str) else each for each in words]
+        of_run = [each for each in self.differences if each.subject in _OF_RUN]
+        of_file = [each for each in self.differences if each.subject not in _OF_RUN]
+        kept = [each for each in of_run if each.subject not in subjects]
+        self.differences = (*sorted([*kept, *new], key=_place), *of_file)
 
     def set_reach(self, distance: float) -> None:
         """Lets MuJoCo detect contacts, without a force, from a distance in m before they touch.
@@ -224,6 +253,12 @@ class Scene:
         self.model.pair_gap += more
         self.model.flex_gap += more
         self._set_margins()
+        if self.model.flg_adhesion:
+            # each of two geoms has it
+            words = (
+                f"adhesion: from the file's gap on → from {format_si(2 * distance, 'm')} before it"
+            )
+            self._announce(["adhesion"], [words] if distance else [])
 
     def set_contact(self, *, is_rigid: bool) -> None:
         """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
@@ -237,14 +272,13 @@ class Scene:
         if is_rigid == bool(own):
             self._set_margins()
             return
-        said = announce_rigid(model)
-        self.differences = tuple(each for each in self.differences if each not in said)
         if not is_rigid:
+            self._announce(_RIGID, [])
             self._restore_contact(model)
             self._own_contact = {}
             return
-        self.differences = said + self.differences
         needed = _rigid_options(model.opt)
+        self._announce(_RIGID, announce_rigid(model, needed))
         own = {name: getattr(model.opt, name) for name in needed}
         own |= {name: getattr(model, name).copy() for name in (*_MARGINS, *_LIMIT_MARGINS)}
         own |= {name: getattr(model, name) - self._reach for name in _GAPS}
@@ -314,7 +348,7 @@ class Scene:
         self.is_carried, words = True, "weight of the tool: felt → carried"
         if loads := hanging_loads(model, trees):
             words += f", but not that of {choices(loads)} on its tendons"
-        self.differences += (SceneChange(words, reason=reason),)
+        self.differences += (SceneChange(words, "weight", reason),)
         self.reset()
 
     def with_tool_carried(self) -> Scene:

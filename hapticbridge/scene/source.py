@@ -96,14 +96,25 @@ def collect_sources(path: Path, main: bytes | None = None) -> tuple[SourceFile, 
     while not all(file.is_relative_to(root) for file in (*files, *passed)) and root != root.parent:
         root = root.parent
     _refuse_links(files, root, path)
+    contents = {
+        key: main if main and file is path else file.read_bytes() for key, file in files.items()
+    }
+    while root != root.parent and not all(
+        homes[key].reaches_all(contents[key], _named_in(key, root).count("/"), root)
+        for key in homes.keys() & contents.keys()
+    ):
+        root = root.parent  # an XML file that lies deeper may climb farther
     sources = []
-    for key, file in files.items():
-        name = key.relative_to(root if key.is_relative_to(root) else key.anchor).as_posix()
-        data = main if main and file is path else file.read_bytes()
+    for key, data in contents.items():
+        name, inner = _named_in(key, root), data
         if key in homes and not data.startswith(_ARCHIVE):
-            data = homes[key].with_inner_names(data, name.count("/"), root)
-        sources.append(SourceFile(name, data))
+            inner = homes[key].with_inner_names(data, name.count("/"), root)
+        sources.append(SourceFile(name, inner))
     return tuple(sources)
+
+
+def _named_in(file: Path, root: Path) -> str:
+    return file.relative_to(root if file.is_relative_to(root) else file.anchor).as_posix()
 
 
 _FILE_NAME = re.compile(
@@ -173,19 +184,38 @@ class _Home:
         does not lie in it has no file there, as in a comment: the last part of its name stays.
         """
         text, pieces, end = data.decode("utf-8", errors="surrogateescape"), [], 0
+        for (start, stop), name, inner in self._outer_names(text, depth, root):
+            if start < end:
+                continue
+            is_found = inner and not _leads_out(inner, depth)
+            last = _parts(name)[-1].rpartition(":")[-1]
+            pieces += [text[end:start], escape(inner if is_found else last)]
+            end = stop
+        return "".join((*pieces, text[end:])).encode("utf-8", errors="surrogateescape")
+
+    def reaches_all(self, data: bytes, depth: int, root: Path) -> bool:
+        """Returns True if an XML file so many folders deep can name all its files relatively."""
+        text = data.decode("utf-8", errors="surrogateescape")
+        return data.startswith(_ARCHIVE) or not any(
+            inner and _leads_out(inner, depth)
+            for _, _, inner in self._outer_names(text, depth, root)
+        )
+
+    def _outer_names(
+        self, text: str, depth: int, root: Path
+    ) -> Iterator[tuple[tuple[int, int], str, str]]:
+        """Yields span, name and relative name of what a file names outside the scene's folder.
+
+        The relative name is empty if no file of the scene has the name.
+        """
         for match in _FILE_NAME.finditer(text):
             group = 1 if match[1] is not None else 2
-            name = unescape(match[group])
-            if match.start(group) < end or not _leads_out(name, depth):
+            if not _leads_out(name := unescape(match[group]), depth):
                 continue
             tag = _TAG.match(text, text.rfind("<", 0, match.start()) + 1)
             home, file = self.of(tag[0] if tag else ""), _key(self.folder / name)
             inner = os.path.relpath(file, _key(home)) if file.is_relative_to(root) else ""
-            if not inner or _leads_out(inner, depth):
-                inner = _parts(name)[-1].rpartition(":")[-1]
-            pieces += [text[end : match.start(group)], escape(inner)]
-            end = match.end(group)
-        return "".join((*pieces, text[end:])).encode("utf-8", errors="surrogateescape")
+            yield match.span(group), name, inner
 
 
 _TAG = re.compile(r"[\w.:-]*")

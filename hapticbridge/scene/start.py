@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.scene.checks import NOTABLE_OVERLAP, listed, overlaps
-from hapticbridge.scene.compile import SceneChange, reset
+from hapticbridge.scene.compile import reset
+from hapticbridge.scene.treatment import SceneChange
 
 VIOLATION = 1e-4
 """Violation in m or rad above which a start is moved. Closed loops in published robots miss by
@@ -109,7 +110,7 @@ def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Sta
         words.append(f"start where {listed(closed)} → closed")
     limited = {row[1] for row, size in first.items() if row[0] == "joint" and size > VIOLATION}
     words += _moved(model, start, end, limited)
-    changes = tuple(map(SceneChange, _at_most(words, "parts of the scene")))
+    changes = tuple(SceneChange(each, "start") for each in _at_most(words, "parts of the scene"))
     return Start(end if words else None, changes, _at_most(remaining, "constraints"))
 
 

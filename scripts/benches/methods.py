@@ -32,8 +32,8 @@ from random_hands import random_motion
 
 from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.device import SimulatedDevice
+from hapticbridge.device.motion_file import read_motion
 from hapticbridge.device.simulated.device import scene_hand
-from hapticbridge.device.trajectory import read_motion
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.lab.maps.contact import cases_of
 from hapticbridge.lab.maps.contact_rigs import ContactRun, Treatment, contact_run, run_case

@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from hapticbridge.confinement import unpacked
 from hapticbridge.device import DeviceInfo, spacemouse
 from hapticbridge.device.falcon.protocol import read_firmware
+from hapticbridge.device.motion_file import read_motion
 from hapticbridge.device.pid.reports import has_force_feedback
 from hapticbridge.device.profile import read_profile
 from hapticbridge.device.rawhid import protocol as rawhid
-from hapticbridge.device.trajectory import read_motion
 from hapticbridge.device.transport import websocket
 from hapticbridge.device.transport.hid_descriptor import fields_of
 from hapticbridge.errors import HapticBridgeError

@@ -27,6 +27,7 @@ from hapticbridge.device.base import (
     checked_read,
     checked_write,
 )
+from hapticbridge.device.motion_file import read_motion
 from hapticbridge.device.simulated.dynamics import (
     DEFAULT_HAND,
     FREE,
@@ -39,7 +40,7 @@ from hapticbridge.device.simulated.dynamics import (
     next_sample,
     sampled_axis,
 )
-from hapticbridge.device.trajectory import Motion, read_motion
+from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.check.perception import FORCE_FLOOR, WEBER
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
-from hapticbridge.device.trajectory import read_motion
+from hapticbridge.device.motion_file import read_motion
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import EngineRun, work_of

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import UNLIMITED
 from hapticbridge.device import Hand, Motion, SimulatedDevice
+from hapticbridge.device.motion_file import read_motion
 from hapticbridge.device.simulated.device import scene_hand
-from hapticbridge.device.trajectory import read_motion
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.methods import METHODS

@@ -1,0 +1,302 @@
+"""Motions from files: a table in CSV, an exported recording, a bag of ROS 2."""
+
+from __future__ import annotations
+
+import os
+import stat
+import struct
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.device.base import USUAL_SPEED_LIMIT
+from hapticbridge.device.trajectory import (
+    ORIENTATION,
+    TIME_AND_POSITION,
+    Motion,
+    first_fault,
+)
+from hapticbridge.errors import DeviceError, choices
+
+# Table in CSV
+
+
+def read_motion(path: str | os.PathLike[str]) -> Motion:
+    """Reads a motion from a CSV file.
+
+    The first line that is neither empty nor a comment (``#``) names the columns, in any order:
+    ``t,x,y,z`` in s and m, and either all or none of ``qw,qx,qy,qz``. Every further line is a row
+    of numbers. Times must strictly increase; the rate is free. Semicolons, beside which a number
+    may have a decimal comma, or tabs may stand in the place of commas. A table that was exported
+    from a recording gives the motion of its device.
+
+    Args:
+        path: The file, UTF-8.
+
+    Returns:
+        The motion, its times counted from the first row.
+
+    Raises:
+        DeviceError: The file cannot be read, or a line is not valid; the message names it.
+
+    Warns:
+        UserWarning: Times look like ms.
+    """
+    path = Path(path)
+    lines = _read_lines(path)
+    numbered = (
+        (number, line)
+        for number, line in enumerate(lines, start=1)
+        if (content := line.lstrip()) and content[0] != "#"
+    )
+    header = next(numbered, None)
+    if header is None:
+        raise DeviceError(f"{path}: the file is empty; it needs a header t,x,y,z and two rows")
+    with_commas = _COMMAS[next((each for each in _COMMAS if each in header[1]), "\t")]
+    names = _column_names(f"{path}, line {header[0]}", header[1].translate(with_commas))
+    width = len(names)
+    columns = [names.index(name) for name in TIME_AND_POSITION + ORIENTATION if name in names]
+    numbers: list[int] = []
+    values: list[float] = []
+    for number, line in numbered:
+        fields = line.translate(with_commas).split(",")
+        if len(fields) != width:
+            raise DeviceError(
+                f"{path}, line {number}: {len(fields)} fields where the header names "
+                f"{width} columns"
+            )
+        try:
+            values.extend([float(fields[column]) for column in columns])
+        except ValueError:
+            column = next(i for i in columns if not _is_number(fields[i]))
+            raise DeviceError(
+                f"{path}, line {number}: column '{names[column]}' holds "
+                f"{fields[column].strip()!r:.40}, which is not a number"
+            ) from None
+        numbers.append(number)
+    if len(numbers) < 2:
+        last = numbers[-1] if numbers else header[0]
+        raise DeviceError(
+            f"{path}, line {last}: the file ends after {len(numbers)} of at least "
+            "two rows of numbers"
+        )
+    table = np.empty((len(numbers), 8))
+    table[:, 4:] = (1.0, 0.0, 0.0, 0.0)
+    table[:, : len(columns)] = np.array(values).reshape(len(numbers), len(columns))
+    if fault := first_fault(table):
+        raise DeviceError(f"{path}, line {numbers[fault[0]]}: {fault[1]}")
+    return _plausible(table, path)
+
+
+_COMMAS = {";": {ord(";"): ",", ord(","): "."}, ",": dict[int, str](), "\t": {ord("\t"): ","}}
+"""Characters to replace in a line, by the character that separates the columns in its header."""
+
+
+def _read_lines(path: Path) -> list[str]:
+    """Reads a text file with any line ending; a byte-order mark is dropped."""
+    try:
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode):
+            kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
+            raise DeviceError(f"{path}: is {kind}, not a CSV file")
+        return path.read_text(encoding="utf-8-sig").split("\n")
+    except FileNotFoundError:
+        raise DeviceError(f"{path}: no such file") from None
+    except UnicodeDecodeError as error:
+        line = path.read_bytes()[: error.start].count(b"\n") + 1
+        raise DeviceError(f"{path}, line {line}: not UTF-8 text, so not a CSV file") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise DeviceError(f"{path}: cannot be read ({reason})") from None
+
+
+def _column_names(where: str, line: str) -> list[str]:
+    """Returns the valid column names of a header."""
+    # some programs quote column names, but not numbers
+    names = [field.strip().strip("\"'").strip().lower() for field in line.split(",")]
+    needed = "a header with the columns t,x,y,z and optionally qw,qx,qy,qz is needed"
+    if all(_is_number(name) for name in names):
+        raise DeviceError(f"{where}: numbers where {needed}")
+    known = TIME_AND_POSITION + ORIENTATION
+    if set(EXPORTED) <= set(names):
+        own = dict(zip(EXPORTED, known, strict=True))
+        return [own.get(name, "") for name in names]
+    if scaled := next((name for name in names if name.endswith(("ms", "mm"))), ""):
+        raise DeviceError(
+            f"{where}: column {scaled!r:.40} looks like {scaled[-2:]}; times are in s and "
+            f"positions in m: divide by 1000, and name the column {scaled[0]}"
+        )
+    if missing := [name for name in TIME_AND_POSITION if name not in names]:
+        raise DeviceError(f"{where}: column {', '.join(missing)} is missing; {needed}")
+    if unknown := [name for name in names if name not in known]:
+        raise DeviceError(f"{where}: unknown column {unknown[0]!r:.40}; {needed}")
+    if len(set(names)) < len(names):
+        duplicate = next(name for name in names if names.count(name) > 1)
+        raise DeviceError(f"{where}: column {duplicate} occurs twice; remove one of them")
+    missing = [name for name in ORIENTATION if name not in names]
+    if 0 < len(missing) < len(ORIENTATION):
+        raise DeviceError(
+            f"{where}: column {', '.join(missing)} is missing; an orientation needs all of "
+            "qw,qx,qy,qz, or none of them"
+        )
+    return names
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+EXPORTED = (
+    "seconds",
+    *(f"device_position_{axis}" for axis in "xyz"),
+    *(f"device_quaternion_{part}" for part in "wxyz"),
+)
+"""Columns of an exported recording that are the device's motion: time, position, orientation."""
+
+MAX_SPAN = 4.0
+"""Extent of a motion in m beyond which a fast one is taken for mm. Devices on a desk reach 1 m; a
+walk through a tracked room is slow."""
+
+MAX_STEP = 0.5
+"""Median time in s between rows above which the times of many rows are taken for ms."""
+
+MANY_ROWS = 20
+
+
+def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
+    """Returns a motion whose times are in s and lengths in m, as far as a hand's motion tells.
+
+    Raises:
+        DeviceError: Lengths look like mm.
+
+    Warns:
+        UserWarning: Times look like ms.
+    """
+    steps, ways = np.diff(table[:, 0]), np.linalg.norm(np.diff(table[:, 1:4], axis=0), axis=1)
+    span = float(np.ptp(table[:, 1:4], axis=0).max())
+    is_slow = len(table) >= MANY_ROWS and float(np.median(steps)) >= MAX_STEP
+    speed = float(np.median(ways / steps)) * (1e3 if is_slow else 1.0)
+    if span > MAX_SPAN and speed > USUAL_SPEED_LIMIT:
+        also = f", and rows {np.median(steps):.3g} s apart, as times in ms have" if is_slow else ""
+        raise DeviceError(
+            f"{path}: the motion spans {span:.3g} m at {speed:.3g} m/s{also}; positions are in m "
+            "and times in s: if these are mm, divide them by 1000"
+        )
+    if is_slow:
+        warnings.warn(
+            f"{path}: rows are {np.median(steps):.3g} s apart, and the motion takes "
+            f"{np.ptp(table[:, 0]):.3g} s; times are in s: if these are ms, divide by 1000",
+            stacklevel=3,
+        )
+    return Motion(table[:, 0], table[:, 1:4], table[:, 4:])
+
+
+# Bag of ROS 2
+
+POSE = "geometry_msgs/msg/PoseStamped"
+
+
+def is_bag(path: Path) -> bool:
+    """Returns True for a whole MCAP file without the topic ``/tick`` of a recording."""
+    try:
+        return "/tick" not in dict(_topics(path))
+    except DeviceError:
+        return False
+
+
+def read_bag(path: Path, topic: str = "") -> Motion:
+    """Reads the motion of a topic of poses from a bag of ROS 2 in MCAP.
+
+    The times are those of the messages' stamps, or of the log where they have none. They are
+    counted from the first.
+
+    Args:
+        path: The file.
+        topic: The topic; it may be empty if there is only one of ``PoseStamped``.
+
+    Raises:
+        DeviceError: The file cannot be read, has no such topic, or a message is not valid.
+    """
+    # imported here, because no other device needs it
+    from mcap.exceptions import McapError  # noqa: PLC0415
+    from mcap.reader import make_reader  # noqa: PLC0415
+
+    kinds = dict(_topics(path))
+    poses = [name for name, kind in kinds.items() if kind == POSE]
+    if topic and topic not in poses:
+        is_there = f"its type is {kinds[topic]}" if topic in kinds else "there is none"
+        raise DeviceError(
+            f"{path}: topic '{topic}' must be of {POSE}, and {is_there}; topics of that type: "
+            f"{choices(poses)}"
+        )
+    if not poses:
+        listed = choices(f"{name} ({kind})" for name, kind in kinds.items())
+        raise DeviceError(f"{path}: has no topic of {POSE}; topics: {listed}")
+    if not topic and len(poses) > 1:
+        raise DeviceError(
+            f"{path}: has several topics of {POSE}; name one, 'trajectory:{path}:{poses[0]}': "
+            f"{choices(poses)}"
+        )
+    topic = topic or poses[0]
+    stamps, logged, numbers = [], [], []
+    with path.open("rb") as file:
+        try:
+            for _, _, message in make_reader(file).iter_messages(topics=[topic]):
+                stamp, pose = _pose_of(message.data)
+                stamps.append(stamp)
+                logged.append(message.log_time)
+                numbers.append(pose)
+        except (McapError, struct.error, ValueError, RuntimeError, EOFError) as error:
+            reason = str(error) or type(error).__name__
+            raise DeviceError(
+                f"{path}: message {len(stamps)} of {topic} cannot be read ({reason})"
+            ) from None
+    times = np.array(stamps if any(stamps) else logged, dtype=np.int64)
+    if len(times) < 2:
+        raise DeviceError(f"{path}: {topic} has {len(times)} of at least two messages")
+    table = np.empty((len(times), 8))
+    table[:, 0] = (times - times[0]) * 1e-9
+    table[:, 1:] = np.array(numbers)[:, [0, 1, 2, 6, 3, 4, 5]]  # ROS has w last
+    if fault := first_fault(table):
+        raise DeviceError(f"{path}, message {fault[0]} of {topic}: {fault[1]}")
+    return _plausible(table, path)
+
+
+def _topics(path: Path) -> Iterator[tuple[str, str]]:
+    """Yields topic and type of every channel of a whole MCAP file.
+
+    Raises:
+        DeviceError: The file is damaged, or its end is missing.
+    """
+    from mcap.exceptions import McapError  # noqa: PLC0415
+    from mcap.reader import make_reader  # noqa: PLC0415
+
+    try:
+        with path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+    except (OSError, McapError, struct.error, ValueError, RuntimeError, EOFError) as error:
+        raise DeviceError(f"{path}: cannot be read ({error})") from None
+    if summary is None:
+        raise DeviceError(f"{path}: the end of the file is missing")
+    for channel in summary.channels.values():
+        schema = summary.schemas.get(channel.schema_id)
+        yield channel.topic, schema.name if schema else "no type"
+
+
+def _pose_of(data: bytes) -> tuple[int, tuple[float, ...]]:
+    """Returns stamp in ns and numbers of a ``PoseStamped``: x, y, z in m, then qx, qy, qz, qw.
+
+    It is CDR: two bytes of the encoding, whose last bit says little-endian, two of options; then
+    the stamp, the length of the frame's name and the name, and the numbers at a multiple of 8.
+    """
+    order = "<" if data[1] & 1 else ">"
+    seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
+    start = 4 + (12 + length + 7) // 8 * 8
+    return seconds * 10**9 + nanoseconds, struct.unpack_from(f"{order}7d", data, start)

@@ -1,0 +1,174 @@
+"""Motions from exported recordings and from bags of ROS 2, and units that people mistake."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from audit_cases import recorded
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+import hapticbridge as hb
+from hapticbridge.check.case import motion_for
+from hapticbridge.device import open_device, read_motion
+from hapticbridge.device.motion_file import read_bag
+from hapticbridge.errors import DeviceError
+from hapticbridge.scene import load_scene
+from hapticbridge.tools.export import export
+
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+TURN = np.array([0.1, -0.2, 0.3, np.sqrt(1 - 0.14)])  # x, y, z, w, as ROS writes them
+
+
+def pose_message(time: int, place: float, kind: str = "geometry_msgs/msg/PoseStamped") -> bytes:
+    """Returns a message with a stamp in ns and a place on the x axis in m."""
+    new = TYPES.types.__getitem__
+    stamp = new("builtin_interfaces/msg/Time")(*divmod(time, 10**9))
+    header = new("std_msgs/msg/Header")(stamp, "world of a long name")
+    if kind.endswith("TwistStamped"):
+        zero = new("geometry_msgs/msg/Vector3")(0.0, 0.0, 0.0)
+        message = new(kind)(header, new("geometry_msgs/msg/Twist")(zero, zero))
+    else:
+        point = new("geometry_msgs/msg/Point")(place, 0.0, 0.5)
+        turn = new("geometry_msgs/msg/Quaternion")(*TURN.tolist())
+        message = new(kind)(header, new("geometry_msgs/msg/Pose")(point, turn))
+    return bytes(TYPES.serialize_cdr(message, kind))
+
+
+def bag(
+    folder: Path, topics: dict[str, list[tuple[int, bytes]]], kind: str = "PoseStamped"
+) -> Path:
+    """Writes a bag as ROS 2 does, a folder with a file in it; times of the log in ns."""
+    whole = f"geometry_msgs/msg/{kind}"
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, messages in topics.items():
+            connection = writer.add_connection(topic, whole, typestore=TYPES)
+            for time, message in messages:
+                writer.write(connection, time, message)
+    return folder
+
+
+def ramp(count: int = 5, start: int = 10**18, late: int = 7) -> list[tuple[int, bytes]]:
+    """Returns messages every 10 ms, 1 mm apart, with stamps; the log is late by some ns."""
+    stamps = [start + 10_000_000 * i for i in range(count)]
+    return [(at + late, pose_message(at, 1e-3 * i)) for i, at in enumerate(stamps)]
+
+
+@pytest.mark.parametrize("is_folder", [False, True])
+def test_a_bag_of_poses_is_a_motion(tmp_path: Path, *, is_folder: bool) -> None:
+    folder = bag(tmp_path / "walk", {"/hand": ramp()})
+    (file,) = folder.glob("*.mcap")
+    device = open_device(f"trajectory:{folder if is_folder else file}")
+    assert device.info.duration == pytest.approx(0.04, abs=1e-12)
+    table = read_bag(file).table
+    np.testing.assert_allclose(table[:, 0], 0.01 * np.arange(5), atol=1e-12)
+    np.testing.assert_allclose(table[:, 1], 1e-3 * np.arange(5))
+    np.testing.assert_allclose(table[:, 3], 0.5)
+    np.testing.assert_allclose(table[:, 4:], np.tile(TURN[[3, 0, 1, 2]], (5, 1)))
+    moved = motion_for(load_scene("point_mass"), file)
+    assert moved is not None
+    assert moved.table[0, 1:4].tolist() == [0, 0, 0]
+    with hb.Bridge("point_mass", device, clock=hb.SimulatedClock()) as bridge:
+        assert bridge.run(duration=0.02).ticks == 20
+
+
+def test_messages_without_stamps_have_the_times_of_the_log(tmp_path: Path) -> None:
+    messages = [(10**18 + 10**7 * i, pose_message(0, 1e-3 * i)) for i in range(3)]
+    (file,) = bag(tmp_path / "walk", {"/hand": messages}).glob("*.mcap")
+    np.testing.assert_allclose(read_bag(file).table[:, 0], [0, 0.01, 0.02], atol=1e-12)
+
+
+def test_of_several_topics_one_is_named(tmp_path: Path) -> None:
+    folder = bag(tmp_path / "two: a, b", {"/hand/left": ramp(), "/hand/right": ramp(9)})
+    (file,) = folder.glob("*.mcap")
+    with pytest.raises(DeviceError, match=r"several topics .*'trajectory:.*:/hand/left'"):
+        open_device(f"trajectory:{file}")
+    for path in (file, folder):
+        device = open_device(f"trajectory:{path}:/hand/right")
+        assert device.info.duration == pytest.approx(0.08, abs=1e-12)
+    with pytest.raises(DeviceError, match=r"topic '/foot' must be .* and there is none; topics"):
+        open_device(f"trajectory:{file}:/foot")
+
+
+def test_a_bag_that_is_no_motion_is_refused_with_what_it_holds(tmp_path: Path) -> None:
+    twist = [
+        (time, pose_message(time, 0.0, "geometry_msgs/msg/TwistStamped")) for time, _ in ramp()
+    ]
+    (file,) = bag(tmp_path / "twist", {"/speed": twist}, "TwistStamped").glob("*.mcap")
+    with pytest.raises(DeviceError, match=r"has no topic of .*PoseStamped; topics: '/speed \(geo"):
+        open_device(f"trajectory:{file}")
+    (file,) = bag(tmp_path / "one", {"/hand": ramp(1)}).glob("*.mcap")
+    with pytest.raises(DeviceError, match="has 1 of at least two messages"):
+        open_device(f"trajectory:{file}")
+    (file,) = bag(tmp_path / "back", {"/hand": [*ramp(3), (2 * 10**18, ramp()[0][1])]}).glob(
+        "*.mcap"
+    )
+    with pytest.raises(DeviceError, match=r"message 3 of /hand: time 0 s after 0\.02 s"):
+        open_device(f"trajectory:{file}")
+    (file,) = bag(tmp_path / "torn", {"/hand": [(0, ramp()[0][1][:40])]}).glob("*.mcap")
+    with pytest.raises(DeviceError, match="message 0 of /hand cannot be read"):
+        open_device(f"trajectory:{file}")
+
+
+def test_big_endian_poses_are_read(tmp_path: Path) -> None:
+    messages = []
+    for i in range(3):
+        head = struct.pack(">BBHiII", 0, 0, 0, 5, 10**7 * i, 2) + b"w\0" + bytes(2)
+        messages.append((i, head + bytes(0) + struct.pack(">7d", i * 1e-3, 0, 0, 0, 0, 0, 1)))
+    (file,) = bag(tmp_path / "big", {"/hand": messages}).glob("*.mcap")
+    np.testing.assert_allclose(read_bag(file).table[:, 1], [0, 1e-3, 2e-3])
+
+
+def test_an_exported_recording_is_the_motion_of_its_device(tmp_path: Path) -> None:
+    file = tmp_path / "run.mcap"
+    recorded(file, load_scene("point_mass"), duration=0.1)
+    export(file, "csv")
+    ticks = hb.read_recording(file).ticks
+    table = read_motion(file.with_suffix(".csv")).table
+    assert table[:, 1:4].tobytes() == ticks["device_position"].tobytes()
+    np.testing.assert_allclose(table[:, 4:], ticks["device_quaternion"], atol=1e-15)
+    np.testing.assert_allclose(table[:, 0], 1e-3 * np.arange(100), atol=1e-12)
+
+
+def table(steps: float, lengths: float, count: int = 30) -> str:
+    """Returns a motion of 1 cm at 100 rows a second, with times and lengths multiplied."""
+    rows = "".join(
+        f"{0.01 * steps * i:.6g},{lengths * 0.01 * np.sin(0.3 * i):.6g},0,0\n" for i in range(count)
+    )
+    return "t,x,y,z\n" + rows
+
+
+MISTAKEN = [
+    (table(1, 1e3), "spans 19.9 m .* if these are mm, divide them by 1000"),
+    (table(1e3, 1e3), "rows 10 s apart, as times in ms have; .* if these are mm"),
+    ("t_ms,x,y,z\n0,0,0,0\n1,0,0,0\n", "'t_ms' looks like ms; .* name the column t"),
+    ("t,x_mm,y_mm,z_mm\n0,0,0,0\n1,0,0,0\n", "'x_mm' looks like mm; .* name the column x"),
+]
+
+
+@pytest.mark.parametrize(("text", "words"), MISTAKEN)
+def test_a_file_in_other_units_is_refused_with_the_unit(
+    tmp_path: Path, text: str, words: str
+) -> None:
+    (tmp_path / "hand.csv").write_text(text)
+    with pytest.raises(DeviceError, match=words):
+        read_motion(tmp_path / "hand.csv")
+
+
+def test_times_that_look_like_ms_are_said_and_run(tmp_path: Path) -> None:
+    (tmp_path / "hand.csv").write_text(table(1e3, 1))
+    with pytest.warns(
+        UserWarning, match=r"rows are 10 s apart, .* if these are ms, divide by 1000"
+    ):
+        assert read_motion(tmp_path / "hand.csv").duration == pytest.approx(290)
+
+
+def test_a_slow_walk_and_a_few_rows_are_no_mistake(tmp_path: Path) -> None:
+    walk = "".join(f"{i},{0.5 * i},0,0\n" for i in range(19))
+    (tmp_path / "hand.csv").write_text("t,x,y,z\n" + walk)
+    assert read_motion(tmp_path / "hand.csv").duration == 18
+    (tmp_path / "hand.csv").write_text(table(1, 1))
+    assert read_motion(tmp_path / "hand.csv").duration == pytest.approx(0.29)
