@@ -13,9 +13,10 @@ it is linear in m, c and k and needs no derivative of the samples; c_0 to c_2 ho
 before. It is fitted with m, c, k >= 0 for each l up to ``MAX_DELAY``, for −F as for F, on each axis
 that moved. The misfit E is the share of (∬F)² that a fit leaves, without unit. A hypothesis (this
 axis with this sign, or a delay beyond the stated one) holds if its E is at most ``MISFIT`` and that
-of every other is ``RATIO`` times as large. A wrong direction holds only if the right one has more
-than ``MISFIT`` for each delay up to ``PULSE`` beyond the stated one: a passive hand that is stiffer
-or heavier in some directions moves sideways, too. A wrong direction or a delay must be found twice.
+of every other is ``RATIO`` times as large. A wrong direction holds only if the right one has at
+least ``EXCLUDED`` for each delay up to ``PULSE`` beyond the stated one: a passive hand that is
+stiffer or heavier in some directions moves sideways, too. A wrong direction or a delay must be
+found ``TIMES`` times, with forces to and fro: a hand that moves by itself may look so by chance.
 
 The signs have neither mean nor trend, so that a mass stands afterwards where it was, and a hand
 that shakes does not move like this.
@@ -68,6 +69,11 @@ a motion is looked at with the larger force."""
 MISFIT, RATIO = 0.05, 5.0
 """Largest E of a hypothesis that holds, and least ratio of the others' to it, without unit."""
 
+EXCLUDED = 0.15
+"""Least E of the right direction where a wrong one holds, without unit. With 0.05, hands 30 times
+as stiff or heavy in one direction as in another are refused in 7 %; with 0.3 fewer reversed axes
+are found."""
+
 MOVED, OWN_MOVED = 0.5, 0.1
 """Least motion of another axis that may be the one that was pushed, and of the pushed one itself,
 as shares of the largest one. Motion left from an earlier push is a few percent."""
@@ -78,8 +84,9 @@ DELAY_STEP, LEAST_DELAY = 2.5e-4, 5e-4
 ALIKE = 1.5e-3
 """Largest difference in s of two delays that are alike."""
 
-PUSHES = 5
-"""Most pushes along an axis. One of which no finding comes twice by then is unknown."""
+TIMES, PUSHES = 3, 6
+"""Number of like findings that count, and most pushes along an axis. An axis without a finding by
+then is unknown. With two findings, 1 % of the hands that move meanwhile were refused."""
 
 EVENT = "probe"
 """Event of a recording with what a probe has found of a hand's device."""
@@ -160,7 +167,7 @@ class Probed:
             return f"not probed: {self.skipped}"
         right, unknown = self.axes(Direction.RIGHT), self.axes(Direction.UNKNOWN)
         texts = [f"{right} answered the right way"] if right else []
-        texts += [f"{unknown} could not be probed, as if held firmly"] if unknown else []
+        texts += [f"{unknown} gave no clear answer"] if unknown else []
         if self.delay:
             texts.append(f"the force acts {format_si(self.delay, 's')} after the sample")
         return ", ".join(texts)
@@ -300,7 +307,7 @@ class Push:
         delay, stated = float(delays[each.argmin()]), hand.info.delay or 0.0
         if (i, sign) != (own, 1.0):
             is_soon = delays <= stated + PULSE
-            if (own, 1.0) in misfits and misfits[own, 1.0][is_soon].min() <= MISFIT:
+            if (own, 1.0) in misfits and misfits[own, 1.0][is_soon].min() <= EXCLUDED:
                 return unknown
             direction = Direction.EXCHANGED if i != own else Direction.REVERSED
             return Answer(AXES[self.axis], direction, moved, delay)
@@ -353,23 +360,24 @@ def probe_devices(
         if is_over() or any(each.is_wrong for own in answers for each in own):
             break
         levels = {i: 0 for i, each in enumerate(hands) if each.force(axis, 0) > 0.0}
-        doubted: dict[int, Answer] = {}
+        doubted: dict[int, list[Answer]] = {}
         for _ in range(PUSHES):
             if not levels or is_over():
                 break
             pushes = [
-                Push(hand.force(axis, levels.get(i, -1)) * (-1.0 if i in doubted else 1.0), axis)
+                Push(hand.force(axis, levels.get(i, -1)) * (-1.0) ** len(doubted.get(i, ())), axis)
                 for i, hand in enumerate(hands)
             ]
             _push(port, sample, pushes, clock)
             for i, level in tuple(levels.items()):
                 answer, is_last = pushes[i].answer(hands[i]), level + 1 == len(LEVELS)
                 is_small = answer.is_wrong and pushes[i].way < TREMOR[axis // 3]
-                is_known = i in doubted and answer.confirms(doubted[i])
+                alike = [each for each in doubted.get(i, ()) if answer.confirms(each)]
+                is_known = len(alike) + 1 == TIMES
                 if not is_last and (is_small or answer.direction == Direction.UNKNOWN):
                     levels[i] = level + 1
                 elif (answer.is_wrong or answer.delay) and not is_known:
-                    doubted[i] = answer
+                    doubted.setdefault(i, []).append(answer)
                 else:
                     answers[i].append(answer)
                     del levels[i]
