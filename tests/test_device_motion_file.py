@@ -103,7 +103,9 @@ def test_a_bag_that_is_no_motion_is_refused_with_what_it_holds(tmp_path: Path) -
     (file,) = bag(tmp_path / "one", {"/hand": ramp(1)}).glob("*.mcap")
     with pytest.raises(DeviceError, match="has 1 of at least two messages"):
         open_device(f"trajectory:{file}")
-    (file,) = bag(tmp_path / "back", {"/hand": [*ramp(3), (2 * 10**18, ramp()[0][1])]}).glob("*.mcap")
+    (file,) = bag(tmp_path / "back", {"/hand": [*ramp(3), (2 * 10**18, ramp()[0][1])]}).glob(
+        "*.mcap"
+    )
     with pytest.raises(DeviceError, match=r"message 3 of /hand: time 0 s after 0\.02 s"):
         open_device(f"trajectory:{file}")
     (file,) = bag(tmp_path / "torn", {"/hand": [(0, ramp()[0][1][:40])]}).glob("*.mcap")
