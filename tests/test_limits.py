@@ -83,7 +83,7 @@ def other_user() -> tuple[str, ...]:
     return ("setpriv", "--reuid=65534", f"--inh-caps={rights}", f"--ambient-caps={rights}")
 
 
-@pytest.mark.parametrize("count", [1, 2, 5, 8, 12, 13, 14, 15, 16, 18, 20, 30, 4095])
+@pytest.mark.parametrize("count", [1, 2, 5, 10, 14, 4095])
 def test_too_few_processes_are_one_sentence(tmp_path: Path, count: int) -> None:
     record = tmp_path / "run.mcap"
     done = run_under(resource.RLIMIT_NPROC, count, record, *other_user())
