@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import json
 import math
@@ -95,6 +96,19 @@ def reason_of(error: OSError, target: Path) -> str:
     if not target.absolute().parent.is_dir():
         return f"the folder {target.parent} does not exist"
     return error.strerror or str(error)
+
+
+_LIMITS = {
+    errno.EFBIG: "'ulimit -f' allows no larger file",
+    errno.EMFILE: "'ulimit -n' allows no more open files; 256 suffice",
+    errno.EAGAIN: "'ulimit -u' allows no further process or thread",
+}
+"""Words on limits of the system, by the error that tells of them."""
+
+
+def limit_words(number: int | None) -> str:
+    """Returns which limit of the system an error number tells of; empty for another error."""
+    return _LIMITS.get(number or 0, "")
 
 
 def remove_file(path: Path) -> None:

@@ -25,7 +25,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from hapticbridge.audit import audit
 from hapticbridge.recording import read_recording, repair
-from hapticbridge.tools.export import export
+from hapticbridge.tools.export import Part, export
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +181,7 @@ def test_a_file_that_lost_its_end_says_so_through_repairs_and_exports(
         assert (values["is_cut"], values["cut"]) == (True, report.cut)
         # a piece from the middle has no event of the repair in its span
         out = tmp_path / "piece.csv"
-        export(path, "csv", out, span=(0.2, 0.4), overwrite=True)
+        export(path, "csv", out, part=Part(span=(0.2, 0.4)), overwrite=True)
         piece = json.loads(out.with_name("piece.csv.json").read_text())
         assert piece["meta"]["incomplete"] == report.cut
         assert ("repaired" in [event["event"] for event in piece["events"]]) == (

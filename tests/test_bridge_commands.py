@@ -420,3 +420,32 @@ def test_a_reset_under_a_hand_at_rest_does_not_throw_it(run: Callable[..., Any])
     (reset,) = (e["tick"] for e in read_recording(path).events if e["event"] == "reset")
     assert not np.ptp(ticks["handle_position"][reset:], axis=0).any()
     assert ticks["lever"][-1] == 1.0
+
+
+GIVEN: dict[int, tuple[Command, bool]] = {
+    10: (Switch(force=False), True),
+    59: (Switch(force=True), False),
+    61: (Reset(), True),
+    120: (Switch(force=True), True),
+    1060: (Reset(), False),
+    1062: (Reset(), True),
+}
+"""Commands by tick of 1 ms, and whether they are taken: 50 ms after any, 1 s after a reset."""
+
+
+def test_commands_are_limited_by_the_clock_of_the_run() -> None:
+    """A fast run refuses and takes the same commands every time, however fast it goes."""
+    answers: dict[int, bool] = {}
+    with Bridge("point_mass", clock=SimulatedClock()) as bridge:
+
+        def give(tick: int) -> None:
+            if tick in GIVEN:
+                try:
+                    bridge.command(GIVEN[tick][0])
+                    answers[tick] = True
+                except CommandError as error:
+                    assert "too recent" in str(error)
+                    answers[tick] = False
+
+        bridge.run(duration=1.2, on_tick=give)
+    assert answers == {tick: is_taken for tick, (_, is_taken) in GIVEN.items()}

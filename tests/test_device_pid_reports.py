@@ -143,9 +143,15 @@ def test_flags_do_for_choices_where_a_device_has_flags() -> None:
         (changed("create", "type", choices=(PID | 0x40,)), "its reports lack constant force"),
         (changed("operation", "operation", choices=(PID | 0x79,)), "that stops an effect"),
         (changed("state", "x", usage=0x10036), "its reports lack an X axis"),
-        (changed("state", "y", usage=0x10036), "its reports lack a Y axis"),
+        (
+            changed("state", "y", usage=0x10036),
+            "lack a Y axis; a device of one axis, such as a wheel, is '--device wheel'",
+        ),
         (changed("state", "x", low=5, high=5), "its axes have no range"),
-        (changed("effect", "enable_y", usage=PID | 0x1), "does not act on both X and Y"),
+        (
+            changed("effect", "enable_y", usage=PID | 0x1),
+            "on both X and Y; a device of one axis, such as a wheel, is '--device wheel'",
+        ),
     ],
 )
 def test_device_lacking_reports_is_refused(layout: dict[str, Report], words: str) -> None:

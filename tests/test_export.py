@@ -26,7 +26,7 @@ from hapticbridge.files import install_command
 from hapticbridge.kernel.record import FORMAT, TICK_DTYPE, TickFlag
 from hapticbridge.recording import read_recording, reader
 from hapticbridge.run.bridge import Bridge
-from hapticbridge.tools.export import ENERGIES, export, sidecar_of
+from hapticbridge.tools.export import ENERGIES, Part, export, sidecar_of
 
 h5py: Any = importlib.import_module("h5py")
 pq: Any = importlib.import_module("pyarrow.parquet")
@@ -238,7 +238,7 @@ def test_a_piece_has_the_ticks_and_events_of_its_time(
         ("rest", (0.1, math.inf), [0.1, None], np.arange(99, COUNT), [100_000_000]),
     ):
         suffix = export(recording, form, overwrite=True).files[0].suffix
-        done = export(recording, form, recording.with_name(name + suffix), span=span)
+        done = export(recording, form, recording.with_name(name + suffix), part=Part(span=span))
         columns, _, meta, events = read(done.files[0])
         np.testing.assert_array_equal(columns["tick"], ticks)
         assert (done.ticks, json.loads(meta["cut"])) == (len(ticks), cut)
@@ -249,7 +249,7 @@ def test_a_piece_is_cut_where_deadlines_were_not_where_ticks_are_counted(tmp_pat
     rows = random_rows(100)
     rows["deadline_ns"][40:] += 500_000_000  # the machine stood still for half a second
     write(tmp_path / "late.mcap", rows)
-    done = export(tmp_path / "late.mcap", "csv", span=(0.3, 0.56))
+    done = export(tmp_path / "late.mcap", "csv", part=Part(span=(0.3, 0.56)))
     assert from_csv(done.files[0])[0]["tick"].tolist() == list(range(40, 59))
 
 

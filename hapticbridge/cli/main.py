@@ -11,6 +11,7 @@ import importlib
 import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -88,6 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         elif words[0] not in COMMANDS:
             code = _refuse(words[0])
         else:
+            _check_limits()
             code = _execute(words[0], words[1:])
     except KeyboardInterrupt as interrupt:
         sentence, code = stop_words(getattr(interrupt, "number", signal.SIGINT))
@@ -100,13 +102,71 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # as in 'hapticbridge --help | head'
         _discard_output()
         code = READER_GONE
-    except (MemoryError, ImportError, OSError) as error:
+    except (MemoryError, ImportError, OSError, RuntimeError) as error:
         code = _system_fault(error)
     return code
 
 
-def _system_fault(error: MemoryError | ImportError | OSError) -> int:
+MIN_MEMORY, MEMORY_PER_PROCESSOR = 1 << 30, 1 << 27
+"""Least address space in bytes of a command, and what each processor adds to it: a run takes 835 MB
+on two. With less, OpenBLAS tries for ever to get the memory of its threads (seen at 700 MB)."""
+
+
+MANY_PROCESSES = 1 << 12
+"""Limit of a user's processes from which on it is not tried whether enough of them can start."""
+
+
+def _check_limits() -> None:
+    """Refuses an address space or a number of threads with which a command cannot run.
+
+    OpenBLAS interrupts the program where it cannot start a thread for each processor.
+
+    Raises:
+        HapticBridgeError: 'ulimit -v' or 'ulimit -u' allows too little.
+    """
+    if sys.platform == "win32":
+        return
+    import resource  # noqa: PLC0415 - for limits alone
+
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    needed = MIN_MEMORY + MEMORY_PER_PROCESSOR * (os.cpu_count() or 1)
+    if limit != resource.RLIM_INFINITY and limit < needed:
+        raise HapticBridgeError(
+            f"'ulimit -v' allows {limit / 1e6:.0f} MB of memory, and at least {needed / 1e6:.0f} "
+            f"MB are needed here: 'ulimit -v {needed // 1024}' or more"
+        )
+    if 0 <= resource.getrlimit(resource.RLIMIT_NPROC)[0] < MANY_PROCESSES:
+        _try_threads(8 + 3 * (os.cpu_count() or 1))  # numpy's, scipy's, the recorder's and ours
+
+
+def _try_threads(count: int) -> None:
+    ended = threading.Event()
+    threads = [threading.Thread(target=ended.wait) for _ in range(count)]
+    started = []
+    try:
+        for each in threads:
+            each.start()
+            started.append(each)
+    finally:
+        ended.set()
+        for each in started:
+            each.join(1.0)
+
+
+_NO_THREAD = "can't start new thread"  # Python's own words
+
+
+def _system_fault(error: MemoryError | ImportError | OSError | RuntimeError) -> int:
     """Says what the system refused; raises what is no fault of the system's again."""
+    number = error.errno if isinstance(error, OSError) else None
+    if isinstance(error, RuntimeError):
+        if str(error) != _NO_THREAD:
+            raise error
+        number = errno.EAGAIN
+    from hapticbridge.files import limit_words  # noqa: PLC0415 - for an error alone
+
+    if words := limit_words(number):
+        return _say("error", words)
     is_full = not isinstance(error, OSError) or error.errno in (None, errno.ENOMEM)
     if is_full and _is_memory_limited():
         words = " ".join(str(error).split())[:200] or "no memory"

@@ -17,7 +17,7 @@ from hapticbridge.recording import read_recording
 from hapticbridge.replay.film import USUAL_SHOT, Shot, draw
 from hapticbridge.tools.compare import Comparison, Difference, compare
 from hapticbridge.tools.dataset import DATASETS, write_dataset
-from hapticbridge.tools.export import EVERYTHING, export, time_of
+from hapticbridge.tools.export import EVERYTHING, Part, export, time_of
 from hapticbridge.units import format_si
 from hapticbridge.view import Address
 from hapticbridge.view.window import check_view
@@ -152,6 +152,9 @@ class Export:
     """Replace the file if it exists."""
     hand: str | None = option(None, metavar="GRIP")
     """Grip of the hand to write, of a run of several; a table has one hand."""
+    sensors: bool = False
+    """Add the readings of the scene's own sensors to a table: the run is simulated again. A data
+    set always holds them."""
     fps: int | None = None
     """Frames per second of a data set, by default 30."""
     camera: str | None = None
@@ -177,15 +180,8 @@ class Export:
                 f"with {' or '.join(DATASETS)}"
             )
         with err.status(f"exporting {plain(str(self.files[0]))} …"):
-            span = self.start, self.end
-            done = export(
-                self.files[0],
-                self.form,
-                self.out,
-                span=span,
-                overwrite=self.overwrite,
-                hand=self.hand,
-            )
+            part = Part((self.start, self.end), self.hand, self.sensors)
+            done = export(self.files[0], self.form, self.out, part=part, overwrite=self.overwrite)
         recording = done.recording
         marks = [time_of(event) for event in recording.events if event.get("event") == "mark"]
         if self.as_json:

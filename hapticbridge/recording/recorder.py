@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.files import remove_file
+from hapticbridge.files import limit_words, remove_file
 from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
@@ -381,7 +381,9 @@ def recorder_process() -> subprocess.Popen[bytes]:
             start_new_session=True,
         )
     except OSError as error:
-        raise RecordingError(f"the recorder cannot be started: {error.strerror}") from error
+        raise RecordingError(
+            f"the recorder cannot be started: {limit_words(error.errno) or error.strerror}"
+        ) from error
 
 
 def _write(stream: IO[bytes], data: bytes) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.files import limit_words
 from hapticbridge.kernel.record import TICK_DTYPE
 
 if TYPE_CHECKING:
@@ -61,7 +62,8 @@ def created(content: str, size: int) -> tuple[mmap.mmap, str]:
         memory, path = _created(folder, size)
     except OSError as error:
         raise RecordingError(
-            f"no room for {content} ({size} bytes) in {folder}: {error.strerror}"
+            f"no room for {content} ({size} bytes) in {folder}: "
+            f"{limit_words(error.errno) or error.strerror}"
         ) from error
     return memory, str(path)
 

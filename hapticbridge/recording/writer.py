@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import math
 import os
+import shutil
 import stat
 import sys
 import tempfile
@@ -25,6 +27,7 @@ from hapticbridge.recording import format as layout
 from hapticbridge.recording import ros_messages
 from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.reader import Recording, read_hands, read_with_attachments
+from hapticbridge.units import format_si
 
 # Chunk index on disk
 
@@ -90,6 +93,7 @@ class _Entries:
 
 if sys.platform != "win32":
     import fcntl
+    import resource
 
 
 def is_being_recorded(path: Path) -> bool:
@@ -110,6 +114,8 @@ RESERVE = 4 << 20
 """Space in bytes reserved beyond the file's end. Records at 1 kHz take 0.4 MB/s before compression,
 and the loop checks its recorder ten times a second. It suffices for 10 kHz and for the index of
 hours."""
+
+_FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG
 
 _KEEP_SIZE, _PUNCH_HOLE = 1, 2  # FALLOC_FL_* of Linux
 
@@ -150,7 +156,9 @@ class Output:
         self._position = self._claimed = 0
         self._claims = self._is_regular and sys.platform == "linux"
         self._fallocate = _fallocate() if self._claims else None
-        self.is_full = False
+        self.is_full, self._limit = False, _file_limit()
+        if self._claims:
+            self._claim()
 
     def write(self, data: bytes) -> int:
         """Writes all data, then extends the reserve; about three calls per second."""
@@ -183,12 +191,20 @@ class Output:
             self._file.truncate(self._position)  # ext4 releases space beyond the end only this way
         self._file.close()
 
+    def remove(self, path: Path) -> None:
+        """Removes the closed file, if it is one."""
+        if self._is_regular:
+            with contextlib.suppress(OSError):
+                path.unlink()
+
     def _claim(self) -> None:
         wanted = self._position + RESERVE
-        number = self._allocate(_KEEP_SIZE, self._claimed, wanted - self._claimed)
+        number = errno.EFBIG  # a reservation beyond the file's end does not look at the limit
+        if wanted <= self._limit:
+            number = self._allocate(_KEEP_SIZE, self._claimed, wanted - self._claimed)
         if number == 0:
             self._claimed = wanted
-        elif number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        elif number in _FULL:
             self.is_full, self._claims = True, False
         elif number != errno.EINTR:
             self._claims = False
@@ -201,6 +217,14 @@ class Output:
         if self._fallocate(self._file.fileno(), mode, first, length) == 0:
             return 0
         return ctypes.get_errno()
+
+
+def _file_limit() -> float:
+    """Returns the largest size of a file in bytes that the system allows this process."""
+    if sys.platform == "win32":
+        return math.inf
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    return math.inf if limit == resource.RLIM_INFINITY else float(limit)
 
 
 def _fallocate() -> Callable[..., int] | None:
@@ -262,7 +286,31 @@ class RecordingWriter:
         try:
             self._start(meta, attachments)
         except OSError as error:
+            if error.errno in _FULL:
+                raise self._too_small(meta, attachments) from None
             raise self._failed(error) from error
+        if self._output.is_full:  # the reserve may not hold what closes the file
+            raise self._too_small(meta, attachments)
+
+    def _too_small(
+        self, meta: Mapping[str, str], attachments: Sequence[Attachment]
+    ) -> RecordingError:
+        """Ends the recording before its first record, and removes what was written."""
+        texts = sum(len(text.encode()) for entry in meta.items() for text in entry)
+        needed = RESERVE + texts + sum(len(attachment.data) for attachment in attachments)
+        self._is_closed = True
+        self._release()
+        self._output.remove(self.path)
+        free: float = shutil.disk_usage(self.path.parent).free
+        owner = "its disk has {} free"
+        if (limit := _file_limit()) < free:
+            free, owner = limit, "'ulimit -f' allows {}"
+        if free > needed:  # a device, or space that was freed since
+            return self._refusal(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+        return RecordingError(
+            f"cannot write the recording {self.path}: it needs {format_si(needed, 'B')} from the "
+            f"start, and {owner.format(format_si(free, 'B'))}"
+        )
 
     def _start(self, meta: Mapping[str, str], attachments: Sequence[Attachment]) -> None:
         self._mcap = Writer(

@@ -15,10 +15,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from hapticbridge.arguments import check_fields, option
@@ -168,8 +169,9 @@ def states(recording: Path, shot: Shot, progress: Progress | None = None) -> dic
         progress: Called with the finished and all frames.
 
     Returns:
-        ``rows`` (records, (n,)), ``qpos`` (n, nq), ``qvel`` (n, nv), ``ctrl`` (n, nu), ``names`` of
-        positions, ``controls`` of ``ctrl``, and with a camera ``pictures``, a PNG each.
+        ``rows`` (records, (n,)), ``qpos`` (n, nq), ``qvel`` (n, nv), ``ctrl`` (n, nu), ``sensors``,
+        ``names`` of positions, ``controls`` of ``ctrl``, ``sensor_names``, and with a camera
+        ``pictures``, a PNG each.
 
     Raises:
         HapticBridgeError: As ``draw``.
@@ -178,6 +180,37 @@ def states(recording: Path, shot: Shot, progress: Progress | None = None) -> dic
     child, work = _Child(opened, shot, progress), partial(_states, opened.path, shot)
     found = child.result(work) if shot.camera is None else child.drawn_with_any(work)[1]
     return {**found, "rows": np.frombuffer(found["rows"], TICK_DTYPE)}
+
+
+class SensorValues(NamedTuple):
+    """Readings of a scene's sensors in each tick of a run, as MuJoCo's step computed them.
+
+    Positions and velocities are those at the start of the tick, forces those that act in it.
+
+    Attributes:
+        names: Name of each number (k,).
+        ticks: Number of each tick (n,), increasing.
+        values: The readings (n, k), in MuJoCo's units.
+    """
+
+    names: tuple[str, ...]
+    ticks: NDArray[np.int64]
+    values: NDArray[np.float64]
+
+
+def sensors(recording: Path) -> SensorValues:
+    """Returns the readings of the scene's own sensors, from a confined process.
+
+    Raises:
+        HapticBridgeError: The scene has none, or as ``draw``.
+    """
+    opened = open_recording(recording, 0)
+    found = _Child(opened, Shot(), None).result(partial(_sensors, opened.path))
+    names = tuple(found["names"])
+    if not names:
+        raise HapticBridgeError(f"the scene of '{recording}' has no sensors")
+    ticks = np.frombuffer(found["ticks"], np.int64)
+    return SensorValues(names, ticks, np.frombuffer(found["values"]).reshape(len(ticks), -1))
 
 
 def still(recording: str | Path, shot: Shot, *, in_process: bool = False) -> bytes:
@@ -336,12 +369,13 @@ def _states(path: Path, shot: Shot, worker: Worker) -> dict[str, Any]:
     model, ours = stage.model, added_actuators(stage.model)
     own = [k for k in range(model.nactuator) if k not in ours]
     ticks = list(film_ticks(stage, shot.fps))
-    rows, seen, pictures = [], [], []
+    rows, seen, pictures, readings = [], [], [], []
     for number, tick in enumerate(ticks, start=1):
         stage.show(tick)
         data = stage.data
         rows.append(stage.row.tobytes())
         seen.append((data.qpos.copy(), data.qvel.copy(), data.ctrl[own].copy()))
+        readings.append(data.sensordata.copy())
         if camera is not None:
             buffer = io.BytesIO()
             Image.fromarray(camera.frame(tick)).save(buffer, "PNG")
@@ -359,10 +393,32 @@ def _states(path: Path, shot: Shot, worker: Worker) -> dict[str, Any]:
         "qpos": qpos,
         "qvel": qvel,
         "ctrl": ctrl,
+        "sensors": np.array(readings),
+        "sensor_names": _sensor_names(model),
         "names": names,
         "controls": [model.actuator(k).name or str(k) for k in own],
         "pictures": pictures,
     }
+
+
+def _sensors(path: Path, worker: Worker) -> dict[str, Any]:
+    """Returns what ``sensors`` does, as bytes."""
+    stage = Stage(open_recording(path, 0), worker.allow_run)
+    ticks, values, names = [], [], _sensor_names(stage.model)
+    for row in range(stage.recording.count if names else 0):
+        stage.show(row)
+        ticks.append(int(stage.row["tick"][0]))
+        values.append(stage.data.sensordata.tobytes())
+    return {"names": names, "ticks": np.array(ticks).tobytes(), "values": b"".join(values)}
+
+
+def _sensor_names(model: mujoco.MjModel) -> list[str]:
+    """Returns a name of each number that a scene's sensors give."""
+    return [
+        f"{model.sensor(sensor).name or sensor}{f'_{k}' if size > 1 else ''}"
+        for sensor, size in enumerate(model.sensor_dim.tolist())
+        for k in range(size)
+    ]
 
 
 _POSITIONS = {

@@ -599,12 +599,12 @@ MAX_WAITING = 8
 stalls."""
 
 INTERVAL = 0.05
-"""Shortest time in s between two commands. A dragged slider looks smooth at 20 per second; each
-command costs the loop about 20 µs, and a flood must not become a load."""
+"""Shortest time in s of the run between two commands. A dragged slider looks smooth at 20 per
+second; each command costs the loop about 20 µs, and a flood must not become a load."""
 
 RESET_INTERVAL = 1.0
-"""Shortest time in s between two resets. The force fades before each and rises after it. With
-a shorter interval, resets could follow each other without any force between them."""
+"""Shortest time in s of the run between two resets. The force fades before each and rises after
+it. With a shorter interval, resets could follow each other without any force between them."""
 
 
 class CommandQueue:
@@ -617,7 +617,7 @@ class CommandQueue:
     Args:
         limits: Limits of the coupling on each hand's device, by the hand's grip.
         is_recorded: True for a recorded run, which can be marked.
-        now: Returns the time in s; it never runs backwards.
+        now: Returns the time in s of the run; it never runs backwards.
 
     Attributes:
         limits: Limits of the coupling on each hand's device, by the hand's grip.

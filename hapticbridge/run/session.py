@@ -290,7 +290,9 @@ class Session:
         self.slow: SlowScene | None = None
         self.inputs: deque[list[Write]] = deque()
         limits = {each.scene.grip: each.coupling_limits for each in self._setups}
-        self.commands = CommandQueue(limits, is_recorded=output.path is not None)
+        self.commands = CommandQueue(
+            limits, is_recorded=output.path is not None, now=lambda: 1e-9 * clock.now()
+        )
         with ExitStack() as resources:
             resources.callback(device.close)  # ``_open`` says why it is called twice
             self._open(resources)

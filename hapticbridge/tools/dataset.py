@@ -9,6 +9,7 @@ camera is named, its pictures. A frame holds
 | ``observation.wrench`` | force and torque on the hand, in N and N m, along the scene's axes   |
 | ``observation.qpos``   | positions of all joints, as MuJoCo has them                          |
 | ``observation.ctrl``   | controls of the scene's own actuators, if there are any              |
+| ``observation.sensors``| readings of the scene's own sensors, if there are any                |
 | ``action``             | pose of the handle one frame later, and the wrench on the tool then  |
 
 References:
@@ -38,9 +39,9 @@ from hapticbridge.replay.film import Shot, states
 POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 
-STATE, ON_HAND, QPOS, CTRL, ACTION = (
+STATE, ON_HAND, QPOS, CTRL, SENSORS, ACTION = (
     *("observation.state", "observation.wrench", "observation.qpos", "observation.ctrl"),
-    "action",
+    *("observation.sensors", "action"),
 )
 
 Progress = Callable[[int, int, str], None]
@@ -95,6 +96,7 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
         ON_HAND: np.concatenate([force_on_hand(rows, axes), torque], axis=1)[:-1],
         QPOS: found["qpos"][:-1],
         CTRL: found["ctrl"][:-1],
+        SENSORS: found["sensors"][:-1],
         ACTION: np.concatenate(
             [rows["handle_position"], rows["handle_quaternion"], rows["wrench_on_tool"]], axis=1
         )[1:],
@@ -104,10 +106,12 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
         ON_HAND: WRENCH,
         QPOS: tuple(found["names"]),
         CTRL: tuple(found["controls"]),
+        SENSORS: tuple(found["sensor_names"]),
         ACTION: (*POSE, *WRENCH),
     }
-    if not found["ctrl"].shape[1]:
-        del values[CTRL], names[CTRL]
+    for name in (CTRL, SENSORS):
+        if not names[name]:
+            del values[name], names[name]
     return Episode(
         name=name,
         scene=recording.meta.get("scene", ""),
@@ -300,11 +304,28 @@ def _of_pictures(stats: dict[str, Any]) -> dict[str, Any]:
 # robomimic
 
 ROBOMIMIC_FILE = "demos.hdf5"
-_OBSERVATIONS = {STATE: "tool_pose", ON_HAND: "hand_wrench", QPOS: "qpos", CTRL: "ctrl"}
+_OBSERVATIONS = {
+    STATE: "tool_pose",
+    ON_HAND: "hand_wrench",
+    QPOS: "qpos",
+    CTRL: "ctrl",
+    SENSORS: "sensors",
+}
+_ACTIONS = {
+    "handle_position": slice(0, 3),
+    "handle_quaternion": slice(3, 7),
+    "wrench": slice(7, 13),
+}
+"""Parts of an action, which ``action_dict`` holds in SI units."""
 
 
 class RobomimicWriter:
     """Writer of a robomimic data set: ``demos.hdf5`` with a group ``data/demo_K`` per episode.
+
+    ``actions`` are from −1 to 1, as robomimic's policies give them: each number a of the whole set
+    is (a − offset)/scale with offset = (max + min)/2 and scale = (max − min)/2, or 1 where nothing
+    changes. ``data`` has the attributes ``action_scale``, ``action_offset`` and ``action_names``;
+    ``action_dict`` of each episode holds the numbers themselves.
 
     Raises:
         RecordingError: h5py is not installed.
@@ -315,14 +336,17 @@ class RobomimicWriter:
         self._file, self._shot = h5py.File(folder / ROBOMIMIC_FILE, "w"), shot
         self._data = self._file.create_group("data")
         self._data.attrs["task"] = task
-        self._count = self._total = 0
+        self._actions: list[NDArray[np.float32]] = []
+        self._total = 0
 
     def add(self, episode: Episode) -> None:
         """Implements ``Writer.add``."""
         count = len(episode)
-        demo = self._data.create_group(f"demo_{self._count}")
+        demo = self._data.create_group(f"demo_{len(self._actions)}")
         demo.attrs["num_samples"], demo.attrs["recording"] = count, episode.name
-        demo["actions"], demo["states"] = episode.values[ACTION], episode.states
+        demo["states"] = episode.states
+        for name, part in _ACTIONS.items():
+            demo[f"action_dict/{name}"] = episode.values[ACTION][:, part]
         done = np.zeros(count)
         done[-1] = 1.0
         demo["rewards"], demo["dones"] = np.zeros(count), done.astype(np.int64)
@@ -336,15 +360,27 @@ class RobomimicWriter:
         for name, values in observed.items():
             demo[f"obs/{name}"] = values
             demo[f"next_obs/{name}"] = np.concatenate([values[1:], values[-1:]])
-        if not self._count:
+        if not self._actions:
             about = {"env_name": episode.scene, "type": 2, "env_kwargs": {"fps": self._shot.fps}}
             self._data.attrs["env_args"] = json.dumps(about)
-        self._count, self._total = self._count + 1, self._total + count
+        self._actions.append(episode.values[ACTION])
+        self._total += count
 
     def close(self) -> None:
         """Implements ``Writer.close``."""
+        low = np.min([actions.min(axis=0) for actions in self._actions], axis=0)
+        high = np.max([actions.max(axis=0) for actions in self._actions], axis=0)
+        offset = (0.5 * (low + high)).astype(np.float32)
+        scale = np.where(high > low, 0.5 * (high - low), 1.0).astype(np.float32)
+        for number, actions in enumerate(self._actions):
+            # rounding may lead a number out by 1e-7
+            normalised = np.clip((actions - offset) / scale, -1.0, 1.0)
+            self._data[f"demo_{number}/actions"] = normalised
+        self._data.attrs["action_offset"], self._data.attrs["action_scale"] = offset, scale
+        self._data.attrs["action_names"] = [*POSE, *WRENCH]
         self._data.attrs["total"] = self._total
-        self._file["mask/train"] = [f"demo_{number}".encode() for number in range(self._count)]
+        demos = [f"demo_{number}".encode() for number in range(len(self._actions))]
+        self._file["mask/train"] = demos
         self._file.close()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 from collections.abc import Iterator, Mapping
@@ -34,7 +35,7 @@ from hapticbridge.run.description import meta_float
 class Sink(Protocol):
     """A table being written."""
 
-    def __init__(self, path: Path, recording: RecordingFile) -> None: ...
+    def __init__(self, path: Path, recording: RecordingFile, columns: TableColumns) -> None: ...
 
     def add(self, ticks: NDArray[np.void]) -> None:
         """Appends records."""
@@ -61,8 +62,8 @@ class CsvSink:
     ``{"units", "flags", "meta", "events"}``, because most programs cannot read comments in a CSV.
     """
 
-    def __init__(self, path: Path, recording: RecordingFile) -> None:
-        self._columns = TableColumns(TICK_DTYPE, recording.period)
+    def __init__(self, path: Path, recording: RecordingFile, columns: TableColumns) -> None:
+        self._columns = columns
         about = {
             "units": self._columns.units,
             "flags": FLAG_LEGEND,
@@ -71,8 +72,9 @@ class CsvSink:
         }
         text = json.dumps(about, indent=1, ensure_ascii=False)
         sidecar_of(path).write_text(text + "\n", encoding="utf-8")
-        self._file = path.open("w", encoding="ascii", newline="")
-        self._file.write(",".join(self._columns.units) + "\n")
+        self._file = path.open("w", encoding="utf-8", newline="")
+        # sensors may have any name
+        csv.writer(self._file, lineterminator="\n").writerow(self._columns.units)
 
     def add(self, ticks: NDArray[np.void]) -> None:
         """Implements ``Sink.add``."""
@@ -107,7 +109,7 @@ class Hdf5Sink:
         RecordingError: h5py is not installed.
     """
 
-    def __init__(self, path: Path, recording: RecordingFile) -> None:
+    def __init__(self, path: Path, recording: RecordingFile, columns: TableColumns) -> None:
         h5py = import_extra("h5py", "HDF5", "hdf5", RecordingError)
         self._file = h5py.File(path, "w", rdcc_nbytes=_CACHE)
         text = h5py.string_dtype()
@@ -119,12 +121,17 @@ class Hdf5Sink:
         self._file.create_dataset("events", (len(events),), text, data=events)
         ticks = self._file.create_group("ticks")
         self._count = 0
-        self._columns, self._sets = TableColumns(TICK_DTYPE, recording.period), []
+        self._columns, self._sets = columns, []
         for (name, unit), kind in zip(
             self._columns.units.items(), self._columns.kinds, strict=True
         ):
             data = ticks.create_dataset(
-                name, (0,), f"<{kind}8", maxshape=(None,), chunks=(_CHUNK,), compression="gzip"
+                name.replace("/", "_"),
+                (0,),
+                f"<{kind}8",
+                maxshape=(None,),
+                chunks=(_CHUNK,),
+                compression="gzip",
             )
             data.attrs["unit"] = unit
             self._sets.append(data)
@@ -157,10 +164,10 @@ class ParquetSink:
         RecordingError: pyarrow is not installed.
     """
 
-    def __init__(self, path: Path, recording: RecordingFile) -> None:
+    def __init__(self, path: Path, recording: RecordingFile, columns: TableColumns) -> None:
         self._arrow = import_extra("pyarrow", "Parquet", "tables", RecordingError)
         parquet = import_extra("pyarrow.parquet", "Parquet", "tables", RecordingError)
-        self._columns = TableColumns(TICK_DTYPE, recording.period)
+        self._columns = columns
         kinds = {"i": self._arrow.int64(), "f": self._arrow.float64()}
         fields = [
             self._arrow.field(name, kinds[kind], nullable=False, metadata={"unit": unit})
@@ -218,7 +225,7 @@ class RerunSink:
         RecordingError: rerun is not installed.
     """
 
-    def __init__(self, path: Path, recording: RecordingFile) -> None:
+    def __init__(self, path: Path, recording: RecordingFile, columns: TableColumns) -> None:
         self._rerun = import_extra("rerun", "a file for rerun", "rerun", RecordingError)
         self._path: list[NDArray[np.float64]] = []
         self._period, self._axes = recording.period, axes_of(recording.meta)
@@ -292,7 +299,7 @@ class RerunSink:
 class FoxgloveSink:
     """Writer of a layout for Foxglove (``.json``), to be imported beside the recording itself."""
 
-    def __init__(self, path: Path, recording: RecordingFile) -> None:
+    def __init__(self, path: Path, recording: RecordingFile, columns: TableColumns) -> None:
         forces = [f"/wrench_on_hand.wrench.force.{axis}" for axis in "xyz"]
         energies = [f"/tick.{energy}" for energy in ENERGIES]
         panels = {
@@ -350,9 +357,62 @@ FORMATS: dict[str, tuple[type[Sink], tuple[str, ...]]] = {
 }
 """Writer and file extensions of each format, the usual extension first."""
 
+TABLES = ("parquet", "csv", "hdf5")
+"""Formats with a column for each number."""
+
 
 EVERYTHING = (-math.inf, math.inf)
 """Unlimited span in s of the run's clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Part of a recording that a table holds.
+
+    Attributes:
+        span: Start and end in s of the run's clock, the end excluded. Only ticks due and events in
+            it are written; metadata ``cut`` then holds the two times. Events that say that the
+            recording lacks an end, and metadata ``incomplete`` with the reason, are always written.
+        hand: Grip of the hand whose records are written; None for a run of one hand.
+        has_sensors: True adds columns ``sensor_NAME``, the readings of the scene's own sensors; the
+            run is simulated again for them.
+    """
+
+    span: tuple[float, float] = EVERYTHING
+    hand: str | None = None
+    has_sensors: bool = False
+
+
+def _columns(recording: RecordingFile, form: str, part: Part) -> TableColumns:
+    if not part.has_sensors:
+        return TableColumns(TICK_DTYPE, recording.period)
+    if form not in TABLES:
+        raise RecordingError(f"sensors are columns of tables: {choices(TABLES)}; not of {form}")
+    return _ColumnsWithSensors(recording)
+
+
+WHOLE = Part()
+"""All ticks of a run of one hand, as recorded."""
+
+
+class _ColumnsWithSensors(TableColumns):
+    """Columns of ticks, and of the readings of a scene's sensors in them."""
+
+    def __init__(self, recording: RecordingFile) -> None:
+        super().__init__(TICK_DTYPE, recording.period)
+        # imported here, because no other table needs the packages that draw
+        from hapticbridge.replay.film import sensors  # noqa: PLC0415
+
+        self._sensors = sensors(recording.path)
+        self.units |= {f"sensor_{name}": "MuJoCo's" for name in self._sensors.names}
+        self.kinds += ["f"] * len(self._sensors.names)
+
+    def values(self, ticks: NDArray[np.void]) -> list[NDArray[Any]]:
+        """Returns the columns of some records, each contiguous, (n,), int64 or float64."""
+        rows = np.searchsorted(self._sensors.ticks, ticks["tick"])
+        readings = np.ascontiguousarray(self._sensors.values[rows].T)
+        return [*super().values(ticks), *readings]
+
 
 _ROUNDING = 0.5e-9
 """Half a nanosecond, in s. Recorded times are whole nanoseconds, so a tick due at 0.3 s counts as
@@ -390,9 +450,8 @@ def export(
     form: str,
     target: str | Path | None = None,
     *,
-    span: tuple[float, float] = EVERYTHING,
+    part: Part = WHOLE,
     overwrite: bool = False,
-    hand: str | None = None,
 ) -> Exported:
     """Writes a recording as a table: a row per tick, a column per number and one of seconds.
 
@@ -406,18 +465,17 @@ def export(
         form: One of ``FORMATS``.
         target: File with an extension of the format; None takes the recording's name with the
             usual one.
-        span: Start and end in s of the run's clock, the end excluded. Only ticks due and events
-            in it are written; metadata ``cut`` then holds the two times. Events that say that the
-            recording lacks an end, and metadata ``incomplete`` with the reason, are always written.
+        part: Span, hand and columns to write.
         overwrite: True replaces existing files.
-        hand: Grip of the hand whose records are written; None for a run of one hand.
 
     Raises:
         RecordingError: The recording cannot be read, or has no such hand; the format is unknown or
             its package is not installed; no tick lies in the span; or the target exists, is the
             recording, has a wrong extension or cannot be written.
+        HapticBridgeError: The scene has no sensors, or cannot be simulated again.
     """
     sink_type, endings = _sink(form)
+    span, hand = part.span, part.hand
     recording = open_recording(path, None if hand is None else hand_named(path, hand))
     target = target_for(path, form) if target is None else Path(target)
     if target.suffix.lower() not in endings:
@@ -429,10 +487,11 @@ def export(
         if file.exists() and not overwrite:
             raise RecordingError(f"'{file}' exists; choose another file or add --overwrite")
     piece, count = _piece(recording, span), 0
+    columns = _columns(recording, form, part)
     draft = target.with_name(f".{target.name}.draft")
     drafts = (draft, sidecar_of(draft)) if form == "csv" else (draft,)
     try:
-        sink = sink_type(draft, piece)
+        sink = sink_type(draft, piece, columns)
         try:
             for ticks in _blocks(recording, span):
                 sink.add(ticks)

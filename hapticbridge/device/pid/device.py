@@ -339,6 +339,9 @@ _BUTTON_PAGE = 9
 """Usage page of buttons."""
 
 
+_OF_A_WHEEL = "a device of one axis, such as a wheel, is '--device wheel' (on Linux)"
+
+
 class Stick:
     """Decoder of a stick's input reports.
 
@@ -365,17 +368,15 @@ class Stick:
             and _CONTROLLERS.intersection(field.collections[:1])
         ]
         self._layout = layout
-        self._axes = (
-            required(place_of(fields, X), "an X axis"),
-            required(place_of(fields, Y), "a Y axis"),
-        )
+        x, y = required(place_of(fields, X), "an X axis"), place_of(fields, Y)
+        if y is None:
+            raise DeviceError(f"its reports lack a Y axis; {_OF_A_WHEEL}")
+        self._axes = x, y
         for place in self._axes:
             if place.field.minimum >= place.field.maximum:
                 raise DeviceError("its axes have no range")
         if not {X, Y} <= forced_axes(layout):
-            raise DeviceError(
-                "its force does not act on both X and Y; it is not a stick but a wheel or similar"
-            )
+            raise DeviceError(f"its force does not act on both X and Y; {_OF_A_WHEEL}")
         self._buttons = _buttons(fields)
         self._places = (*self._axes, *(place for _, place in self._buttons))
         self.step = tuple(2.0 / (p.field.maximum - p.field.minimum) for p in self._axes)

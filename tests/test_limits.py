@@ -1,0 +1,132 @@
+"""Small disks and limits of the system: one sentence before the force, or a whole recording."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import hapticbridge as hb
+from hapticbridge.cli.main import MEMORY_PER_PROCESSOR, MIN_MEMORY, main
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="these limits are Linux's")
+
+PROGRAM = (sys.executable, "-m", "hapticbridge")
+NEEDED = MIN_MEMORY + MEMORY_PER_PROCESSOR * (os.cpu_count() or 1)
+
+
+def run_under(
+    limit: int, value: int, record: Path, *before: str
+) -> subprocess.CompletedProcess[str]:
+    """Runs the bridge for 0.2 s under a limit of the system, recorded."""
+    options = ("--fast", "--duration", "0.2", "--record", str(record), "--overwrite")
+    return subprocess.run(
+        [*before, *PROGRAM, "run", "point_mass", *options],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        preexec_fn=lambda: resource.setrlimit(limit, (value, value)),
+    )
+
+
+def check_end(done: subprocess.CompletedProcess[str], record: Path) -> bool:
+    """Checks a run that ended well, or with one sentence; returns True if it ended well."""
+    assert "Traceback" not in done.stderr, done.stderr
+    if done.returncode == 0:
+        assert hb.audit(record).verdict == "passive"
+        return True
+    assert done.returncode == 2, done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1, done.stderr
+    return False
+
+
+@pytest.mark.parametrize("size", [NEEDED // 16, NEEDED // 4, NEEDED // 2, NEEDED - 1, NEEDED])
+def test_too_little_memory_is_one_sentence(tmp_path: Path, size: int) -> None:
+    record = tmp_path / "run.mcap"
+    done = run_under(resource.RLIMIT_AS, size, record)
+    assert check_end(done, record) == (size >= NEEDED)
+    assert ("'ulimit -v' allows" in done.stderr) == (size < NEEDED)
+
+
+@pytest.mark.parametrize("count", [5, 7, 9, 12, 64])
+def test_too_few_files_are_one_sentence(tmp_path: Path, count: int) -> None:
+    record = tmp_path / "run.mcap"
+    done = run_under(resource.RLIMIT_NOFILE, count, record)
+    if not check_end(done, record):
+        assert count < 64
+        assert "'ulimit -n' allows" in done.stderr
+
+
+@pytest.mark.parametrize("size", [0, 10_000, 1_000_000, 4_000_000, 20_000_000])
+def test_too_small_files_are_one_sentence(tmp_path: Path, size: int) -> None:
+    record = tmp_path / "run.mcap"
+    done = run_under(resource.RLIMIT_FSIZE, size, record)
+    assert check_end(done, record) == (size > 5_000_000)
+    assert size > 5_000_000 or "'ulimit -f' allows" in done.stderr
+
+
+def other_user() -> tuple[str, ...]:
+    """Returns a command that runs another as a user whom the limit on processes binds."""
+    if os.geteuid() != 0:
+        return ()
+    if shutil.which("setpriv") is None:
+        pytest.skip("needs setpriv")
+    rights = "+dac_override,+dac_read_search,+fowner"
+    return ("setpriv", "--reuid=65534", f"--inh-caps={rights}", f"--ambient-caps={rights}")
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 10, 14, 4095])
+def test_too_few_processes_are_one_sentence(tmp_path: Path, count: int) -> None:
+    record = tmp_path / "run.mcap"
+    done = run_under(resource.RLIMIT_NPROC, count, record, *other_user())
+    if not check_end(done, record):
+        assert count < 30, done.stderr
+        assert "'ulimit -u' allows" in done.stderr
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    place = tmp_path / "disk"
+    place.mkdir()
+    yield place
+    subprocess.run(["umount", place], check=False, capture_output=True)
+
+
+@pytest.mark.parametrize("size", [200, 400, 1000, 2000, 4000, 4300, 4500, 6000, 20000])
+def test_a_small_disk_is_refused_or_holds_a_whole_recording(disk: Path, size: int) -> None:
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}k", "none", str(disk)]
+    if subprocess.run(mount, check=False, capture_output=True).returncode:
+        pytest.skip("needs the right to mount")
+    record = disk / "run.mcap"
+    words = ["run", "peg_in_hole", "--fast", "--duration", "10", "--record", str(record)]
+    code = main(words)
+    if not record.exists():
+        assert (code, size < 4300) == (2, True)
+        assert list(disk.iterdir()) == []
+        return
+    assert size > 4200
+    assert code in (0, 2)
+    recording = hb.read_recording(record)
+    assert (recording.is_cut, recording.problems) == (False, ())
+    assert len(recording.ticks) > 100
+    assert hb.audit(record).verdict == "passive"
+
+
+def test_the_refusal_of_a_small_disk_has_the_sizes(
+    disk: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1000k", "none", str(disk)]
+    if subprocess.run(mount, check=False, capture_output=True).returncode:
+        pytest.skip("needs the right to mount")
+    words = ["run", "point_mass", "--fast", "--duration", "1", "--record", str(disk / "run.mcap")]
+    assert main(words) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "it needs 4.2 MB from the start, and its disk has 1.02 MB free" in error
