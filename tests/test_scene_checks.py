@@ -25,6 +25,7 @@ from hapticbridge.kernel.codes import (
     coupling_ids,
 )
 from hapticbridge.scene import load_scene, scene_names, scene_path
+from hapticbridge.scene.checks import unmetered_work
 from hapticbridge.scene.inputs import input_writes
 
 
@@ -158,6 +159,32 @@ def test_options_that_exclude_the_coupling_are_changed_and_told(
 def test_what_does_unmetered_work_is_warned_of(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="wind does work"):
         load_scene(scene_file(tmp_path, mjcf("<option wind='1 0 0'/>")))
+    floor = "<geom name='floor' type='plane' size='1 1 1' pos='0 0 -1' adhesion='1'/>"
+    with pytest.warns(UserWarning, match="adhesion that pulls across a gap does work"):
+        load_scene(scene_file(tmp_path, mjcf(world=floor)))
+    model = load_scene(scene_file(tmp_path, mjcf())).model
+    assert unmetered_work(model) == {}
+    model.body_plugin[1] = 0  # MuJoCo ships none with passive forces
+    assert "the plugin of a body may do work" in unmetered_work(model)["plugin"]
+
+
+@pytest.mark.parametrize("name", ["passive", "control", "act_gain"])
+def test_a_callback_of_the_program_is_refused_at_load_and_before_a_run(
+    tmp_path: Path, name: str
+) -> None:
+    path = scene_file(tmp_path, mjcf())
+    scene, clear = load_scene(path), getattr(mujoco, f"set_mjcb_{name}")
+    clear(lambda *_: 0.0)
+    try:
+        with pytest.raises(hb.SceneError, match=rf"mjcb_{name}.*set_mjcb_{name}\(None\)"):
+            load_scene(path)
+        bridge = hb.Bridge(scene, "simulated", clock=hb.SimulatedClock())
+        with pytest.raises(hb.SceneError, match=f"mjcb_{name}"), bridge:
+            pass
+    finally:
+        clear(None)
+    with hb.Bridge(scene, "simulated", clock=hb.SimulatedClock()) as bridge:
+        assert bridge.run(0.01).ticks == 10
 
 
 def test_options_and_timestep_are_set_whatever_the_file_says(tmp_path: Path) -> None:

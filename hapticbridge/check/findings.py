@@ -20,7 +20,7 @@ from hapticbridge.check.run_faults import run_faults
 from hapticbridge.errors import choices
 from hapticbridge.run.fidelity import fidelity
 from hapticbridge.scene import compile_scene
-from hapticbridge.scene.checks import first_pump
+from hapticbridge.scene.checks import first_pump, unmetered_work
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.fault import Fault
 from hapticbridge.scene.first_faults import (
@@ -61,9 +61,9 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
                 f"the scene runs with a change, {change}, because {change.treatment.why}",
                 "run --as-is, which refuses the scene",
             )
-    place = places.with_attribute("wind") or places.option("wind")
-    for concern in case.source.concerns:
-        yield Fault("unmetered work", place, concern, "remove wind")
+    for name, concern in unmetered_work(case.model).items():
+        place = places.with_attribute(name) or places.option(name)
+        yield Fault("unmetered work", place, concern, f"remove {name}")
 
 
 def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:

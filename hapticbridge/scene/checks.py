@@ -234,8 +234,8 @@ NOTABLE_OVERLAP = 1e-3
 MuJoCo's own contacts rest 0.1 mm deep, and soft ones deeper; rigid contacts hold these silently."""
 
 
-def check_options(spec: mujoco.MjSpec) -> list[str]:
-    """Refuses options that are incompatible with the coupling; returns warnings.
+def check_options(spec: mujoco.MjSpec) -> None:
+    """Refuses options that are incompatible with the coupling.
 
     Raises:
         SceneError: An option has state that is not saved (ipc).
@@ -246,13 +246,41 @@ def check_options(spec: mujoco.MjSpec) -> list[str]:
             "the scene enables flag ipc, whose state cannot be saved and simulated again; "
             "disable it"
         )
-    warnings = []
-    if np.any(np.asarray(option.wind)):
-        warnings.append(
-            "wind does work on the scene that no port meters; the audit may report the environment "
-            "as active"
-        )
-    return warnings
+
+
+_CALLBACKS = ("act_bias", "act_dyn", "act_gain", "contactfilter", "control", "passive", "time")
+
+
+def refuse_callbacks() -> None:
+    """Refuses MuJoCo's callbacks into Python.
+
+    Raises:
+        SceneError: Names one that is set.
+    """
+    for name in _CALLBACKS:
+        if getattr(mujoco, f"get_mjcb_{name}")() is not None:
+            raise SceneError(
+                f"this program set MuJoCo's callback mjcb_{name}, which a loop without Python "
+                f"cannot call and an audit does not know; mujoco.set_mjcb_{name}(None) removes it, "
+                "and Bridge.set_input applies forces and controls of a program"
+            )
+
+
+def unmetered_work(model: mujoco.MjModel) -> dict[str, str]:
+    """Returns what does work on a compiled scene that no port meters.
+
+    Returns:
+        A sentence for each attribute or element that does it, by its name.
+    """
+    found = dict[str, str]()
+    active = "that no port meters; the audit may report the environment as active"
+    if np.any(model.opt.wind):
+        found["wind"] = f"wind does work on the scene {active}"
+    if np.any(model.geom_adhesion) or np.any(model.pair_adhesion):
+        found["adhesion"] = f"adhesion that pulls across a gap does work on the scene {active}"
+    if np.any(model.body_plugin >= 0):
+        found["plugin"] = f"the plugin of a body may do work on the scene {active}"
+    return found
 
 
 _MASSES = ("mass", "density", "diaginertia", "fullinertia")

@@ -19,7 +19,9 @@ from hapticbridge.scene.checks import (
     check_numbers,
     check_options,
     check_start,
+    refuse_callbacks,
     refuse_overlap,
+    unmetered_work,
 )
 from hapticbridge.scene.compile import (
     START_KEYFRAME,
@@ -119,14 +121,12 @@ class SceneSource:
         spec: MuJoCo's specification of it.
         sources: The original bytes of the file, its includes and its assets.
         parameters: Value of each of the scene's parameters, in the unit of its parameter file.
-        concerns: Clauses on deviations of the run from the file.
     """
 
     path: Path
     spec: mujoco.MjSpec
     sources: tuple[SourceFile, ...]
     parameters: dict[str, float]
-    concerns: tuple[str, ...] = ()
 
 
 def load_scene(
@@ -202,10 +202,10 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
         spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
         raise SceneError(f"cannot read scene '{path}': {clause(error)}") from None
-    concerns = check_options(spec)
+    check_options(spec)
     check_numbers(sources)
     values = apply_parameters(spec, path, parameters)
-    return SceneSource(path, spec, sources, values, tuple(concerns))
+    return SceneSource(path, spec, sources, values)
 
 
 def spec_source(spec: mujoco.MjSpec) -> SceneSource:
@@ -227,7 +227,8 @@ def spec_source(spec: mujoco.MjSpec) -> SceneSource:
     }
     sources += tuple(SourceFile(name, held[name]) for name in sorted(held.keys() - known))
     check_numbers(sources)
-    return SceneSource(path, spec, sources, {}, tuple(check_options(spec)))
+    check_options(spec)
+    return SceneSource(path, spec, sources, {})
 
 
 def _name_folders(spec: mujoco.MjSpec) -> None:
@@ -337,6 +338,7 @@ def compile_scene(
     grips = (grip,) if isinstance(grip, str) else tuple(grip)
     if not grips:
         raise SceneError(f"no grip is named for scene '{path}'; name one per hand")
+    refuse_callbacks()
     changes = set_options(spec, as_is=as_is)
     with _refused(path):
         about_grip = [said for each in grips for said in add_grip(spec, each)]
@@ -346,7 +348,7 @@ def compile_scene(
         changes += sized
         if not as_is and (excluded := exclude_nested(spec, model, grips[0])):
             changes, model = changes + excluded, spec.compile()
-        concerns = [*source.concerns, *about_grip]
+        concerns = [*unmetered_work(model).values(), *about_grip]
         for each in dict.fromkeys(grips):
             check_model(model, each)
         for each in dict.fromkeys(grips):

@@ -33,6 +33,7 @@ from hapticbridge.kernel.rigid_contact import (
     largest_margin,
     rigid_margins,
 )
+from hapticbridge.scene.checks import refuse_callbacks
 from hapticbridge.scene.compile import clause, go_to_start
 from hapticbridge.scene.handle import (
     add_weld,
@@ -151,8 +152,9 @@ class Scene:
         """Reserves the scene for one bridge, because two bridges would move one tool.
 
         Raises:
-            SceneError: Another bridge uses it.
+            SceneError: Another bridge uses it, or a callback of MuJoCo is set.
         """
+        refuse_callbacks()
         if self._is_claimed:
             raise SceneError(f"scene '{self.name}' is in use by another bridge; load it again")
         self._is_claimed = True

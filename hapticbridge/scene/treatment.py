@@ -132,8 +132,8 @@ TREATMENTS: dict[str, Treatment] = {
         "a contact is seen before it closes; it rests where the file says", is_rigid=True,
     ),
     "adhesion": Treatment(
-        "geom, pair", "adhesion", "changed", "pulls from as much farther as the gap is wider",
-        "contacts are seen ahead",
+        "geom, pair", "adhesion", "changed", "from as much farther as the gap is wider; said",
+        "contacts are seen ahead, and no port meters the pull",
     ),
     "gap": Treatment(
         _CONTACTS, "gap", "changed", "wider by the method's reach",
