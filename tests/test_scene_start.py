@@ -314,6 +314,41 @@ def test_box_between_two_walls_without_room_is_held_there_and_said(tmp_path: Pat
     assert "pushed out at once → held" in said
 
 
+PUSHED = """<body name="push" pos="1 0 .2"><joint name="push" type="slide" axis="1 0 0"
+  range=".1 .3"/><geom name="push" type="box" size=".02 .02 .02"/></body>""" + CUP.replace(
+    "0 0 .03", "1.12 0 .2"
+)
+"""Part that its limit moves into a free one."""
+FLOATING = """<body pos="1 0 .01"><joint name="across" type="slide" axis="1 0 0"/>
+  <geom name="puck" type="box" size=".02 .02 .02"/></body>
+  <geom name="floor" type="plane" size="2 2 .1"/>""" + CUP.replace("0 0 .03", "1.03 0 .04")
+"""Part without a joint out of the floor, and a free part inside it."""
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (PUSHED, ["start of joint 'push': 0 mm → 100 mm, its limit", "start of body 'cup': moved"]),
+        (
+            FLOATING,
+            [
+                "start where geom 'puck' and geom 'cup' overlap by 10 mm → closed",
+                "start of joint 'across': 0 mm → -",
+                "start of body 'cup': moved",
+                "start where geom 'floor' and geom 'puck' overlap by 10 mm: pushed out at once →",
+            ],
+        ),
+    ],
+)
+def test_pairs_that_can_be_moved_apart_are_whatever_else_the_start_needs(
+    tmp_path: Path, text: str, said: list[str]
+) -> None:
+    started = started_said(load_scene(scene_file(tmp_path, scene_text(text))))
+    assert len(started) == len(said)
+    for words, opening in zip(started, said, strict=True):
+        assert words.startswith(opening)
+
+
 def test_start_out_of_the_table_is_where_the_scenes_own_contacts_push_it(tmp_path: Path) -> None:
     scene = load_scene(scene_file(tmp_path, scene_text(CUP)))
     model = mujoco.MjModel.from_xml_string(scene_text(CUP))
