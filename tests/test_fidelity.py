@@ -15,7 +15,6 @@ from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.kernel.ledger import ENERGY_TOLERANCE
 from hapticbridge.run.fidelity import (
     NO_HAND,
-    NOTABLE_ENERGY,
     Cause,
     Fidelity,
     fidelity,
@@ -231,24 +230,6 @@ def test_fast_joints_create_no_energy(tmp_path: Path) -> None:
     for substeps in (1, 2, 4):
         found = moved(scene(tmp_path, SPINNING.format(8, 20)), substeps)
         assert found.created <= ENERGY_TOLERANCE
-        assert not found.creation
-
-
-def test_energy_that_fast_joints_create_beside_contacts_of_the_scene_is_told(
-    tmp_path: Path,
-) -> None:
-    pressed = """<body pos="0 -1 0"><joint type="slide" range="0 1" limited="true" stiffness="10"
-        springref="-.5"/><geom size=".02" mass=".1"/></body>"""
-    text = SPINNING.format(8, 20).replace("</worldbody>", pressed + "</worldbody>")
-    source = scene(tmp_path, text.replace("0 0 0 0 0 0", 7 * "0 ").replace("1 0 0 0", "1 0 0 0 0"))
-    setting = RunPoint(NO_HAND, PERIOD, contact="scene")
-    found = fidelity(source, compile_scene(source), setting)
-    assert found is not None
-    assert found.created > NOTABLE_ENERGY
-    assert "the audit may call it active" in found.creation
-    assert "--contact rigid (tried: " in found.calming(setting)
-    calm = moved(source)
-    assert (calm.creation, calm.calming(setting)) == ("", "")
 
 
 def test_the_comparison_starts_where_the_bridge_starts_and_without_the_mocap_body_it_replaces(

@@ -542,8 +542,6 @@ class Run:
             )
         elif moved is not None and moved.deviations:
             notify("; ".join(filter(None, (str(moved), moved.advice(setting)))))
-        if moved is not None and moved.creation:
-            notify("; ".join(filter(None, (moved.creation, moved.calming(setting)))))
         return count
 
     def _scene_ticks(self, scene: Scene) -> int:
