@@ -216,6 +216,22 @@ def test_run_keeps_the_short_step(call: Called, tmp_path: Path) -> None:
     assert (code, "stretch limit" in err) == (3, True)
 
 
+SECOND = '<body pos="1 .5 1"><joint/><geom size=".01" pos="0 0 -.1"/><site name="left"/></body>'
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "code"),
+    [(SINKING, "the cause is rigid contacts", 0), (FILTER, "the scene diverges here", 3)],
+)
+def test_run_of_several_hands_says_what_moves_otherwise(
+    call: Called, tmp_path: Path, text: str, words: str, code: int
+) -> None:
+    path = scene(tmp_path, text.replace("</worldbody>", SECOND + "</worldbody>")).path
+    hands = ("--hand", "grip=simulated", "--hand", "left=simulated")
+    found, _, err = call("run", path, *hands, "--fast", "--duration", 0.2)
+    assert (found, words in " ".join(err.split()), "--substeps" in err) == (code, True, False)
+
+
 SPINNING = """<mujoco><option gravity="0 0 0"/><worldbody>
 <body><joint axis="0 0 1"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass="1"/>
 <body pos=".3 0 0"><joint axis="0 1 0"/>

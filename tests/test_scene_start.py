@@ -53,6 +53,11 @@ CORDED = scene_text(
     PART.replace("</body>", '<site name="b"/></body><site name="a" pos="0 0 .4"/>'),
     '<tendon><spatial name="cord" range="0 .2"><site site="a"/><site site="b"/></spatial></tendon>',
 )
+BALANCED = scene_text(
+    ARM.format("j1", 0, "") + ARM.format("j2", 0.5, ""),
+    '<tendon><fixed name="belt"><joint joint="j1" coef="1"/><joint joint="j2" coef="-1"/></fixed>'
+    '</tendon><equality><tendon tendon1="belt" polycoef=".5 1 0 0 0"/></equality>',
+)
 
 CASES = {
     BEYOND: ["start of joint 'elbow': 0 deg → 20 deg, its limit"],
@@ -69,6 +74,11 @@ CASES = {
         "start of connect of body 'part' and 'tool': 100 mm off → closed",
         "start of body 'tool': turned by 8.56 deg",
         "start of body 'part': turned by 5.91 deg",
+    ],
+    BALANCED: [
+        "start of tendon equality of tendon 'belt': 28.6 deg off → closed",
+        "start of joint 'j1': 0 deg → 14.3 deg",
+        "start of joint 'j2': 0 deg → -14.3 deg",
     ],
     CORDED: [
         "start of tendon 'cord': 100 mm beyond its limit → closed",

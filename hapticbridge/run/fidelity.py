@@ -316,7 +316,7 @@ class _FileMotion:
         constraint = _working(self.last, found.deviations[0].number, way)
         causes: list[Cause] = []
         remedy, bearable, force = None, _force(scene, setting) + MORE, 0.0
-        for undone, other in self._settings(setting):
+        for undone, other in self._settings(scene, setting):
             trial = self._tried(scene, other)
             if trial.size < 0.5 * found.size and not set(causes) & set(undone):
                 causes += undone
@@ -387,9 +387,11 @@ class _FileMotion:
             return np.full(model.nbody, math.inf)
         return _size(_places(other).apart(self.end))
 
-    def _settings(self, setting: RunPoint) -> Iterator[tuple[tuple[Cause, ...], RunPoint]]:
+    def _settings(
+        self, scene: Scene, setting: RunPoint
+    ) -> Iterator[tuple[tuple[Cause, ...], RunPoint]]:
         """Yields settings of a run that undo one replacement or two, with what they undo."""
-        own = _with_step(setting, self.step)
+        own = _with_step(scene, setting, self.step)
         if own != setting:
             yield (Cause.TIME_STEP,), own
         if setting.contact == RIGID:
@@ -512,16 +514,16 @@ def own_substeps(
     one = fidelity(source, scene, replace(setting, substeps=1), max_work=MAX_WORK)
     if one is None or not one.deviations:
         return 1, one
-    own = _with_step(setting, one.step)
+    own = _with_step(scene, setting, one.step)
     if own.substeps <= 1:
         return 1, one
     more = fidelity(source, scene, own, max_work=MAX_WORK)
     return (own.substeps, more) if more is not None and more.size < one.size else (1, one)
 
 
-def _with_step(setting: RunPoint, step: float) -> RunPoint:
+def _with_step(scene: Scene, setting: RunPoint, step: float) -> RunPoint:
     """Returns a setting whose scene has a time step in s, or as many substeps as there may be."""
     if step > (1.0 + ROUNDING) * setting.period:
         return replace(setting, period=step, substeps=1)
-    count = math.ceil(setting.period / step - ROUNDING)
-    return replace(setting, substeps=min(count, MAX_SUBSTEPS))
+    most = 1 if scene.has_several_hands else MAX_SUBSTEPS
+    return replace(setting, substeps=min(math.ceil(setting.period / step - ROUNDING), most))

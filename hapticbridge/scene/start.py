@@ -254,11 +254,16 @@ def row_name(model: mujoco.MjModel, row: tuple[str, int]) -> str:
 
 
 def _off(model: mujoco.MjModel, row: tuple[str, int], size: float) -> str:
-    kind, number = row
+    (kind, number), eq = row, mujoco.mjtEq
+    if kind == "equality":
+        of, number = int(model.eq_type[number]), int(model.eq_obj1id[number])
+        kind = {int(eq.mjEQ_JOINT): "joint", int(eq.mjEQ_TENDON): "tendon"}.get(of, "")
+    if kind == "tendon":  # a fixed one is the sum of its joints
+        first = int(model.tendon_adr[number])
+        is_fixed = int(model.wrap_type[first]) == int(mujoco.mjtWrap.mjWRAP_JOINT)
+        kind, number = ("joint", int(model.wrap_objid[first])) if is_fixed else ("", 0)
     is_angle = kind == "joint" and int(model.jnt_type[number]) in _HINGES
-    if kind == "equality" and int(model.eq_type[number]) == int(mujoco.mjtEq.mjEQ_JOINT):
-        is_angle = int(model.jnt_type[model.eq_obj1id[number]]) in _HINGES
-    beyond = "off" if kind == "equality" else "beyond its limit"
+    beyond = "off" if row[0] == "equality" else "beyond its limit"
     return f"{_place(size, is_angle=is_angle)} {beyond}"
 
 
