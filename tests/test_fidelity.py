@@ -89,6 +89,20 @@ def test_contacts_are_named_where_they_are_the_cause_and_undone_where_that_mends
     assert "rigid contacts in place of the file's own" in str(found)
 
 
+EDGES = """<mujoco><option timestep="0.001"/><worldbody>
+<flexcomp name="rope" type="grid" count="8 1 1" spacing=".03 .03 .03" pos="0 0 1" radius=".003"
+mass=".05" dim="1"><pin id="0"/><edge stiffness="20" damping=".1"/></flexcomp>
+<body pos="1 0 1"><joint/><geom size=".01" pos="0 0 -.1"/><site name="grip"/></body>
+</worldbody></mujoco>"""
+"""A rope of springs, whose length is constant once it is loaded."""
+
+
+def test_a_change_of_the_scene_at_load_is_told_from_options_of_the_run(tmp_path: Path) -> None:
+    found = moved(scene(tmp_path, EDGES))
+    assert found.deviations
+    assert (found.causes, found.remedy) == ((Cause.LOAD,), None)
+
+
 MARGIN = """<mujoco><option timestep="0.001" gravity="0 0 0"/><worldbody>
 <body name="finger"><joint name="knuckle" axis="0 1 0" range="0 90" margin="0.02" damping=".01"/>
 <geom type="capsule" fromto="0 0 0 .05 0 0" size=".005" mass=".5"/></body>

@@ -17,7 +17,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import RIGID
 from hapticbridge.demand.rehearsal import RunPoint, rehearsal_parameters
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.codes import OK, held_body
+from hapticbridge.kernel.codes import OK, added_actuators, held_body
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.kernel.parameters import MAX_SUBSTEPS
@@ -27,6 +27,7 @@ from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.scene import Scene, SceneSource, plain_model
 from hapticbridge.scene.checks import ancestors
 from hapticbridge.scene.compile import reset
+from hapticbridge.scene.handle import copy_values
 from hapticbridge.scene.rehearsal import holding_force
 from hapticbridge.scene.start import constraint_name
 from hapticbridge.units import format_si
@@ -82,7 +83,8 @@ class Cause(Enum):
 
     TIME_STEP = "the time step"
     CONTACT = "rigid contacts in place of the file's own"
-    OPTIONS = "the integrator, or another option that a run replaces"
+    LOAD = "what is changed in the scene as it is loaded"
+    OPTIONS = "the integrator and the solver's options"
 
 
 class Places(NamedTuple):
@@ -305,8 +307,8 @@ class _FileMotion:
     def against(self, scene: Scene, setting: RunPoint) -> Fidelity:
         """Compares with the motion in the bridge, and looks for causes and a remedy.
 
-        The run's replacements are undone one after the other. The integrator is the cause by
-        elimination.
+        The run's replacements are undone one after the other. Where that helps little, the changed
+        scene moves under the file's own options, which tells changes at load from options.
         """
         found = self._compared(scene, setting)
         if not found.deviations:
@@ -326,11 +328,26 @@ class _FileMotion:
                 remedy = other if force <= bearable else None
         return replace(
             found,
-            causes=tuple(causes) or (Cause.OPTIONS,),
+            causes=tuple(causes) or (self._other_cause(scene, found.deviations[0]),),
             constraint=constraint,
             remedy=remedy,
             force=force if remedy else 0.0,
         )
+
+    def _other_cause(self, scene: Scene, worst: Deviation) -> Cause:
+        """Tries the changed scene with the file's own options."""
+        scene.set_contact(is_rigid=False)
+        model = copy.copy(scene.model)
+        model.actuator_gainprm[list(added_actuators(model))] = 0.0
+        model.actuator_biasprm[list(added_actuators(model))] = 0.0
+        _hold(model, self.held)
+        copy_values(self.model.opt, model.opt)
+        scene.reset()
+        end = _moved(model, scene.data, self.count)
+        if end is None:
+            return Cause.LOAD
+        apart = _places(copy.copy(self.data), end.qpos).apart(self.end)
+        return Cause.LOAD if 2.0 * _size(apart)[worst.number] >= worst.size else Cause.OPTIONS
 
     def _tried(self, scene: Scene, setting: RunPoint) -> Fidelity:
         """Compares a remedy; one that the scene refuses counts as one with which it diverges."""

@@ -126,10 +126,10 @@ def carry_over(old: mujoco.MjModel, new: mujoco.MjModel) -> None:
         elif value.shape == target.shape:
             target[...] = value
     for part in ("opt", "stat"):
-        _copy_values(getattr(old, part), getattr(new, part))
+        copy_values(getattr(old, part), getattr(new, part))
 
 
-def _copy_values(old: object, new: object) -> None:
+def copy_values(old: object, new: object) -> None:
     """Copies all values of a part of a model, such as its options, to that of another model."""
     for name in dir(old):
         if name.startswith("_"):
