@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 
 _PREFIXES = (
+    (1e9, "G"),
     (1e6, "M"),
     (1e3, "k"),
     (1.0, ""),

@@ -174,7 +174,7 @@ def test_the_potential_is_told_as_its_change_since_the_start(call: Called, tmp_p
 
 def test_trip_is_told_with_what_to_do_about_it(call: Called, tmp_path: Path) -> None:
     path = tmp_path / "millimetres.csv"
-    path.write_text("t,x,y,z\n0,0,0,0\n0.1,3,0,0\n")
+    path.write_text("t,x,y,z\n0,0,0,0\n0.01,0.5,0,0\n")
     code, _, err = call("run", "point_mass", "--fast", "--device", f"trajectory:{path}")
     assert code == 3
     assert "than the stretch limit; check the motion's unit (m)" in err

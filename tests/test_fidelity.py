@@ -15,7 +15,6 @@ from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.kernel.ledger import ENERGY_TOLERANCE
 from hapticbridge.run.fidelity import (
     NO_HAND,
-    NOTABLE_ENERGY,
     Cause,
     Fidelity,
     fidelity,
@@ -88,6 +87,20 @@ def test_contacts_are_named_where_they_are_the_cause_and_undone_where_that_mends
     assert found.remedy == RunPoint(NO_HAND, PERIOD, contact="scene")
     assert "--contact scene (tried: " in found.advice(RunPoint(NO_HAND, PERIOD))
     assert "rigid contacts in place of the file's own" in str(found)
+
+
+EDGES = """<mujoco><option timestep="0.001"/><worldbody>
+<flexcomp name="rope" type="grid" count="8 1 1" spacing=".03 .03 .03" pos="0 0 1" radius=".003"
+mass=".05" dim="1"><pin id="0"/><edge stiffness="20" damping=".1"/></flexcomp>
+<body pos="1 0 1"><joint/><geom size=".01" pos="0 0 -.1"/><site name="grip"/></body>
+</worldbody></mujoco>"""
+"""A rope of springs, whose length is constant once it is loaded."""
+
+
+def test_a_change_of_the_scene_at_load_is_told_from_options_of_the_run(tmp_path: Path) -> None:
+    found = moved(scene(tmp_path, EDGES))
+    assert found.deviations
+    assert (found.causes, found.remedy) == ((Cause.LOAD,), None)
 
 
 MARGIN = """<mujoco><option timestep="0.001" gravity="0 0 0"/><worldbody>
@@ -217,6 +230,22 @@ def test_run_keeps_the_short_step(call: Called, tmp_path: Path) -> None:
     assert (code, "stretch limit" in err) == (3, True)
 
 
+SECOND = '<body pos="1 .5 1"><joint/><geom size=".01" pos="0 0 -.1"/><site name="left"/></body>'
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "code"),
+    [(SINKING, "the cause is rigid contacts", 0), (FILTER, "the scene diverges here", 3)],
+)
+def test_run_of_several_hands_says_what_moves_otherwise(
+    call: Called, tmp_path: Path, text: str, words: str, code: int
+) -> None:
+    path = scene(tmp_path, text.replace("</worldbody>", SECOND + "</worldbody>")).path
+    hands = ("--hand", "grip=simulated", "--hand", "left=simulated")
+    found, _, err = call("run", path, *hands, "--fast", "--duration", 0.2)
+    assert (found, words in " ".join(err.split()), "--substeps" in err) == (code, True, False)
+
+
 SPINNING = """<mujoco><option gravity="0 0 0"/><worldbody>
 <body><joint axis="0 0 1"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass="1"/>
 <body pos=".3 0 0"><joint axis="0 1 0"/>
@@ -231,24 +260,6 @@ def test_fast_joints_create_no_energy(tmp_path: Path) -> None:
     for substeps in (1, 2, 4):
         found = moved(scene(tmp_path, SPINNING.format(8, 20)), substeps)
         assert found.created <= ENERGY_TOLERANCE
-        assert not found.creation
-
-
-def test_energy_that_fast_joints_create_beside_contacts_of_the_scene_is_told(
-    tmp_path: Path,
-) -> None:
-    pressed = """<body pos="0 -1 0"><joint type="slide" range="0 1" limited="true" stiffness="10"
-        springref="-.5"/><geom size=".02" mass=".1"/></body>"""
-    text = SPINNING.format(8, 20).replace("</worldbody>", pressed + "</worldbody>")
-    source = scene(tmp_path, text.replace("0 0 0 0 0 0", 7 * "0 ").replace("1 0 0 0", "1 0 0 0 0"))
-    setting = RunPoint(NO_HAND, PERIOD, contact="scene")
-    found = fidelity(source, compile_scene(source), setting)
-    assert found is not None
-    assert found.created > NOTABLE_ENERGY
-    assert "the audit may call it active" in found.creation
-    assert "--contact rigid (tried: " in found.calming(setting)
-    calm = moved(source)
-    assert (calm.creation, calm.calming(setting)) == ("", "")
 
 
 def test_the_comparison_starts_where_the_bridge_starts_and_without_the_mocap_body_it_replaces(

@@ -115,7 +115,14 @@ def test_force_and_torque_share_an_owner() -> None:
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(-0.0, "0 N"), (0.99996, "1 N"), (1234.0, "1.23 kN"), (9.996e-4, "1 mN"), (-2e6, "-2 MN")],
+    [
+        (-0.0, "0 N"),
+        (0.99996, "1 N"),
+        (1234.0, "1.23 kN"),
+        (9.996e-4, "1 mN"),
+        (-2e6, "-2 MN"),
+        (2.15e9, "2.15 GN"),
+    ],
 )
 def test_a_number_has_three_digits_and_the_prefix_that_fits(value: float, text: str) -> None:
     assert format_si(value, "N") == text

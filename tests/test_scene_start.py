@@ -53,6 +53,11 @@ CORDED = scene_text(
     PART.replace("</body>", '<site name="b"/></body><site name="a" pos="0 0 .4"/>'),
     '<tendon><spatial name="cord" range="0 .2"><site site="a"/><site site="b"/></spatial></tendon>',
 )
+BALANCED = scene_text(
+    ARM.format("j1", 0, "") + ARM.format("j2", 0.5, ""),
+    '<tendon><fixed name="belt"><joint joint="j1" coef="1"/><joint joint="j2" coef="-1"/></fixed>'
+    '</tendon><equality><tendon tendon1="belt" polycoef=".5 1 0 0 0"/></equality>',
+)
 
 CASES = {
     BEYOND: ["start of joint 'elbow': 0 deg → 20 deg, its limit"],
@@ -69,6 +74,11 @@ CASES = {
         "start of connect of body 'part' and 'tool': 100 mm off → closed",
         "start of body 'tool': turned by 8.56 deg",
         "start of body 'part': turned by 5.91 deg",
+    ],
+    BALANCED: [
+        "start of tendon equality of tendon 'belt': 28.6 deg off → closed",
+        "start of joint 'j1': 0 deg → 14.3 deg",
+        "start of joint 'j2': 0 deg → -14.3 deg",
     ],
     CORDED: [
         "start of tendon 'cord': 100 mm beyond its limit → closed",
@@ -304,7 +314,16 @@ def test_parts_that_begin_inside_each_other_are_moved_apart_before_the_run(tmp_p
         "start of body 'cup': moved by 10 mm",
     ]
     # the file itself starts inside the table, and nothing there touches the tool
-    assert depth(load_scene(scene_file(tmp_path, scene_text(CUP)), as_is=True)) > 9e-3
+    with pytest.warns(UserWarning, match="'cup' overlap by 10 mm at the start, and stay so"):
+        assert depth(load_scene(scene_file(tmp_path, scene_text(CUP)), as_is=True)) > 9e-3
+
+
+def test_parts_that_do_not_touch_by_the_files_own_flag_stay_inside_each_other(
+    tmp_path: Path,
+) -> None:
+    off = '<option><flag contact="disable"/></option>'
+    text = scene_text(CUP).replace("<mujoco>", f"<mujoco>{off}")
+    assert started_said(load_scene(scene_file(tmp_path, text))) == []
 
 
 def test_box_between_two_walls_without_room_is_held_there_and_said(tmp_path: Path) -> None:
@@ -312,6 +331,41 @@ def test_box_between_two_walls_without_room_is_held_there_and_said(tmp_path: Pat
     assert depth(scene) == pytest.approx(0.01, abs=1e-6)
     (said,) = started_said(scene)
     assert "pushed out at once → held" in said
+
+
+PUSHED = """<body name="push" pos="1 0 .2"><joint name="push" type="slide" axis="1 0 0"
+  range=".1 .3"/><geom name="push" type="box" size=".02 .02 .02"/></body>""" + CUP.replace(
+    "0 0 .03", "1.12 0 .2"
+)
+"""Part that its limit moves into a free one."""
+FLOATING = """<body pos="1 0 .01"><joint name="across" type="slide" axis="1 0 0"/>
+  <geom name="puck" type="box" size=".02 .02 .02"/></body>
+  <geom name="floor" type="plane" size="2 2 .1"/>""" + CUP.replace("0 0 .03", "1.03 0 .04")
+"""Part without a joint out of the floor, and a free part inside it."""
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (PUSHED, ["start of joint 'push': 0 mm → 100 mm, its limit", "start of body 'cup': moved"]),
+        (
+            FLOATING,
+            [
+                "start where geom 'puck' and geom 'cup' overlap by 10 mm → closed",
+                "start of joint 'across': 0 mm → -",
+                "start of body 'cup': moved",
+                "start where geom 'floor' and geom 'puck' overlap by 10 mm: pushed out at once →",
+            ],
+        ),
+    ],
+)
+def test_pairs_that_can_be_moved_apart_are_whatever_else_the_start_needs(
+    tmp_path: Path, text: str, said: list[str]
+) -> None:
+    started = started_said(load_scene(scene_file(tmp_path, scene_text(text))))
+    assert len(started) == len(said)
+    for words, opening in zip(started, said, strict=True):
+        assert words.startswith(opening)
 
 
 def test_start_out_of_the_table_is_where_the_scenes_own_contacts_push_it(tmp_path: Path) -> None:

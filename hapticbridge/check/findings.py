@@ -80,10 +80,6 @@ def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     if found is not None and found.doubt:
         change = "a shorter time step, with which the places no longer change"
         yield Fault("time step matters", place, found.doubt, change)
-    if found is not None and found.creation:
-        kind = "energy in the slack" if case.is_rigid else "energy created"
-        change = found.calming(case.setting) or "slower joints"
-        yield Fault(kind, place, found.creation, change)
 
 
 def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:

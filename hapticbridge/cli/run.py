@@ -508,6 +508,9 @@ class Run:
             infos.append(opened.info)
             grasps.append(self._grasp(grip, joint, opened))
         one = self._without_buttons()._for_devices(infos)
+        if self.options.substeps is None:
+            with working("trying the scene"):
+                one = one._with(substeps=one._own_substeps(source, scene, infos[0]))
         return one._feel(scene, self._with_their_buttons(grasps), clock, stack, window, interrupts)
 
     def _with_their_buttons(self, grasps: Sequence[Grasp]) -> list[Grasp]:
@@ -542,8 +545,6 @@ class Run:
             )
         elif moved is not None and moved.deviations:
             notify("; ".join(filter(None, (str(moved), moved.advice(setting)))))
-        if moved is not None and moved.creation:
-            notify("; ".join(filter(None, (moved.creation, moved.calming(setting)))))
         return count
 
     def _scene_ticks(self, scene: Scene) -> int:

@@ -45,7 +45,8 @@ def rehearsal_parameters(scene: Scene, setting: RunPoint) -> RunParameters:
         SceneError: A value is out of range.
     """
     substeps = setting.substeps
-    method = default_method(substeps).with_contact(setting.contact)
+    method = default_method(substeps, has_several_hands=scene.has_several_hands)
+    method = method.with_contact(setting.contact)
     parameters = unguarded_parameters(scene, setting.coupling, setting.period, substeps, method)
     # an error inside the C function would end the process; the first step in Python raises instead
     mujoco.mj_step(scene.model, scene.data)

@@ -354,7 +354,7 @@ def device_for(
         options |= {_HAND_PREFIX + field: value for field, value in asdict(hand).items()}
         if hand != usual:
             notify(
-                f"the simulated hand grips with {hand.stiffness:.3g} N/m instead of "
+                f"the simulated hand grips with {hand.stiffness:.0f} N/m instead of "
                 f"{usual.stiffness:g}, so that it lifts this tool"
             )
     others = [each for each in scene.other_grips if each != str(Grip(grip_axis, "joint"))]

@@ -5,10 +5,8 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum
-from itertools import pairwise
 from typing import NamedTuple, Self
 
 import mujoco
@@ -40,7 +38,7 @@ SECONDS = 1.0
 MAX_WORK = 1e5
 """Largest work of one motion at the start of a run, in degrees of freedom and constraint rows,
 summed over its steps: 0.3 to 0.7 s. Heavier scenes are compared over less than ``SECONDS`` there,
-without a trial of remedies, and in full by a check."""
+and in full by a check."""
 
 PLACE, TURN = 1e-3, 0.01
 """Largest distance in m and angle in rad between two places of a body that count as one: what
@@ -63,8 +61,8 @@ MORE = 1.0
 hand bear more is none: it would begin with a push."""
 
 NOTABLE_ENERGY = 1e-4
-"""Energy in J that a scene may create without a hand and without a word: a tenth of what a hand
-puts in when it taps."""
+"""Energy in J that a scene may create with a remedy: a tenth of what a hand puts in when it
+taps."""
 
 ROUNDING = 1e-9
 """Relative error of a time step as it is written."""
@@ -78,16 +76,15 @@ NO_HAND = Coupling(1e-6, 0.0)
 
 
 class Cause(Enum):
-    """Replacement of the bridge that makes a scene move differently, in the order of the trials.
+    """Replacement of the bridge that makes a scene move differently.
 
     The value is its name.
     """
 
+    TIME_STEP = "the time step"
+    CONTACT = "rigid contacts in place of the file's own"
     LOAD = "what is changed in the scene as it is loaded"
     OPTIONS = "the integrator and the solver's options"
-    TIME_STEP = "the time step"
-    METHOD = "the method's own steps, which take back energy that joints create"
-    CONTACT = "rigid contacts in place of the file's own"
 
 
 class Places(NamedTuple):
@@ -142,12 +139,11 @@ class Fidelity:
         step: The file's own time step in s.
         seconds: Time in s that was compared.
         created: Energy in J that the scene created meanwhile in the bridge.
-        causes: Replacements that move the first of the deviations furthest.
+        causes: Replacements without which the first deviation is less than half as large.
         constraint: Name of the constraint of the file whose force does most of the work between
             both places of its body; empty if none does.
         remedy: Rate, substeps and contact with which no body deviates, tried; None without one.
         force: Largest force in N with which a still hand holds the tool with the remedy.
-        calmer: Substeps and contact with which the scene creates no energy, tried; None without.
     """
 
     deviations: tuple[Deviation, ...]
@@ -160,7 +156,6 @@ class Fidelity:
     constraint: str = ""
     remedy: RunPoint | None = None
     force: float = 0.0
-    calmer: RunPoint | None = None
 
     @property
     def size(self) -> float:
@@ -202,21 +197,6 @@ class Fidelity:
             "far away as in a run"
         )
 
-    @property
-    def creation(self) -> str:
-        """Sentence on energy that the scene creates; empty if there is hardly any.
-
-        Fast joints create it in MuJoCo's steps. It is taken back (``kernel.ledger``) unless
-        contacts of the scene's own act.
-        """
-        if not NOTABLE_ENERGY < self.created < math.inf:
-            return ""
-        return (
-            f"without a hand, the scene creates {format_si(self.created, 'J')} within "
-            f"{self.seconds:.2g} s, as fast joints do in MuJoCo's steps, and the audit may call it "
-            "active"
-        )
-
     def advice(self, setting: RunPoint) -> str:
         """Returns options of a run that mend a deviation, and what they gave; empty without."""
         if self.remedy is None:
@@ -226,12 +206,6 @@ class Fidelity:
             f"{format_si(PLACE, 'm')}, and a still hand holds the tool with at most "
             f"{format_si(self.force, 'N')})"
         )
-
-    def calming(self, setting: RunPoint) -> str:
-        """Returns options of a run with which the scene creates no energy; empty without."""
-        if self.calmer is None:
-            return ""
-        return f"{_flags(self.calmer, setting)} (tried: it then creates none)"
 
 
 def _flags(changed: RunPoint, setting: RunPoint) -> str:
@@ -331,52 +305,72 @@ class _FileMotion:
         return self.count * self.step
 
     def against(self, scene: Scene, setting: RunPoint) -> Fidelity:
-        """Compares with the motion in the bridge, and looks for causes and remedies."""
-        here, found = self._compared(scene, setting)
-        way = np.zeros(self.model.nv)
-        mujoco.mj_differentiatePos(self.model, way, 1.0, scene.data.qpos, self.last.qpos)
-        if found.creation:
-            calm = (each for each in self._calmer(setting) if not self._tried(scene, each).creation)
-            found = replace(found, calmer=next(calm, None))
+        """Compares with the motion in the bridge, and looks for causes and a remedy.
+
+        The run's replacements are undone one after the other. Where that helps little, the changed
+        scene moves under the file's own options, which tells changes at load from options.
+        """
+        found = self._compared(scene, setting)
         if not found.deviations:
             return found
-        worst = found.deviations[0].number
-        causes = tuple(self._causes(scene, setting, here, worst))
-        found = replace(found, causes=causes, constraint=_working(self.last, worst, way))
-        if self.seconds < SECONDS - self.step:
-            return found  # too heavy for trials at the start of a run
-        most = _force(scene, setting) + MORE
-        for other in self._settings(setting):
+        way = np.zeros(self.model.nv)
+        mujoco.mj_differentiatePos(self.model, way, 1.0, scene.data.qpos, self.last.qpos)
+        constraint = _working(self.last, found.deviations[0].number, way)
+        causes: list[Cause] = []
+        remedy, bearable, force = None, _force(scene, setting) + MORE, 0.0
+        for undone, other in self._settings(scene, setting):
             trial = self._tried(scene, other)
-            if trial.deviations or trial.created > max(found.created, NOTABLE_ENERGY):
-                continue
-            if (force := _force(scene, other)) <= most:
-                return replace(found, remedy=other, force=force)
-        return found
+            if trial.size < 0.5 * found.size and not set(causes) & set(undone):
+                causes += undone
+            is_calm = trial.created <= max(found.created, NOTABLE_ENERGY)
+            if remedy is None and is_calm and not trial.deviations:
+                force = _force(scene, other)
+                remedy = other if force <= bearable else None
+        return replace(
+            found,
+            causes=tuple(causes) or (self._other_cause(scene, found.deviations[0]),),
+            constraint=constraint,
+            remedy=remedy,
+            force=force if remedy else 0.0,
+        )
+
+    def _other_cause(self, scene: Scene, worst: Deviation) -> Cause:
+        """Tries the changed scene with the file's own options."""
+        scene.set_contact(is_rigid=False)
+        model = copy.copy(scene.model)
+        model.actuator_gainprm[list(added_actuators(model))] = 0.0
+        model.actuator_biasprm[list(added_actuators(model))] = 0.0
+        _hold(model, self.held)
+        copy_values(self.model.opt, model.opt)
+        scene.reset()
+        end = _moved(model, scene.data, self.count)
+        if end is None:
+            return Cause.LOAD
+        apart = _places(copy.copy(self.data), end.qpos).apart(self.end)
+        return Cause.LOAD if 2.0 * _size(apart)[worst.number] >= worst.size else Cause.OPTIONS
 
     def _tried(self, scene: Scene, setting: RunPoint) -> Fidelity:
         """Compares a remedy; one that the scene refuses counts as one with which it diverges."""
         try:
-            return self._compared(scene, setting)[1]
+            return self._compared(scene, setting)
         except SceneError:  # its own contacts refuse a tool that starts inside something
             return replace(self._diverged, created=math.inf)
 
-    def _compared(self, scene: Scene, setting: RunPoint) -> tuple[Places | None, Fidelity]:
-        """Returns places in the bridge, None if it diverges, and what deviates."""
+    def _compared(self, scene: Scene, setting: RunPoint) -> Fidelity:
+        """Returns what deviates from this motion in the bridge."""
         created = self._moved_here(scene, replace(setting, coupling=NO_HAND))
         if math.isinf(created):
-            return None, self._diverged
+            return self._diverged
         found = Fidelity((), (), int(self._are_free().sum()), self.step, self.seconds, created)
-        here = self._places(scene.data)
-        apart = here.apart(self.end)
+        apart = _places(copy.copy(self.data), scene.data.qpos).apart(self.end)
         sizes = np.where(self._are_free(), _size(apart), 0.0)
         if sizes.max(initial=0.0) <= 1.0:
-            return here, found
+            return found
         moved, spread = self.start.apart(self.end)[0], self._spread()
         allowed = np.where(spread < CHAOS, SPREAD * spread, math.inf)
         names = [str(self.model.body(i).name) or str(i) for i in range(self.model.nbody)]
         worst = [int(i) for i in np.argsort(-sizes) if sizes[i] > 1.0]
-        return here, replace(
+        return replace(
             found,
             deviations=tuple(
                 Deviation(names[i], float(apart[0, i]), float(apart[1, i]), float(moved[i]), i)
@@ -410,64 +404,17 @@ class _FileMotion:
             return np.full(model.nbody, math.inf)
         return _size(_places(other).apart(self.end))
 
-    def _settings(self, setting: RunPoint) -> Iterator[RunPoint]:
-        """Yields settings of a run that undo one replacement or two."""
-        own = _with_step(setting, self.step)
+    def _settings(
+        self, scene: Scene, setting: RunPoint
+    ) -> Iterator[tuple[tuple[Cause, ...], RunPoint]]:
+        """Yields settings of a run that undo one replacement or two, with what they undo."""
+        own = _with_step(scene, setting, self.step)
         if own != setting:
-            yield own
+            yield (Cause.TIME_STEP,), own
         if setting.contact == RIGID:
-            yield replace(setting, contact="scene")
+            yield (Cause.CONTACT,), replace(setting, contact="scene")
             if own != setting:
-                yield replace(own, contact="scene")
-
-    def _calmer(self, setting: RunPoint) -> Iterator[RunPoint]:
-        """Yields settings of a run in which fast joints may create less energy."""
-        if setting.contact != RIGID:
-            yield replace(setting, contact="rigid")
-        yield replace(setting, substeps=min(2 * setting.substeps, MAX_SUBSTEPS))
-
-    def _causes(
-        self, scene: Scene, setting: RunPoint, here: Places | None, body: int
-    ) -> Iterator[Cause]:
-        """Yields the replacements that move a body furthest, or at least half as far.
-
-        The file's motion gets one replacement after the other, until it is that of the bridge;
-        ``here`` is None where that diverges.
-        """
-        motions = [self.end, *self._replaced(scene)]
-        with suppress(SceneError):  # its own contacts refuse a tool that starts inside something
-            motions.append(self._compared(scene, replace(setting, contact="scene"))[0])
-        motions += [motions[-1]] * (len(Cause) - len(motions)) + [here]
-        known = [each for each in motions if each is not None]
-        if len(known) < len(motions):
-            yield list(Cause)[motions.index(None) - 1]
-            return
-        sizes = [float(_size(after.apart(before))[body]) for before, after in pairwise(known)]
-        for cause, size in zip(Cause, sizes, strict=True):
-            if size >= 0.5 * max(sizes):
-                yield cause
-
-    def _replaced(self, scene: Scene) -> Iterator[Places | None]:
-        """Yields the file's motion with the changed scene, then its options, then its time step."""
-        scene.set_contact(is_rigid=False)
-        model, own = copy.copy(scene.model), scene.model.opt.timestep
-        for name in ("gainprm", "biasprm"):
-            getattr(model, f"actuator_{name}")[list(added_actuators(model))] = 0.0
-        _hold(model, self.held)
-        scene.reset()
-        for options, step in (
-            (self.model.opt, self.step),
-            (scene.model.opt, self.step),
-            (scene.model.opt, own),
-        ):
-            copy_values(options, model.opt)
-            model.opt.timestep = step
-            end = _moved(model, scene.data, max(round(self.seconds / step), 1))
-            yield None if end is None else self._places(end)
-
-    def _places(self, data: mujoco.MjData) -> Places:
-        """Returns the places of the file's bodies in a scene with handle."""
-        return _places(copy.copy(self.data), data.qpos)
+                yield (Cause.TIME_STEP, Cause.CONTACT), replace(own, contact="scene")
 
     def _moved_here(self, scene: Scene, setting: RunPoint) -> float:
         """Moves a scene by its ticks in the bridge.
@@ -581,21 +528,19 @@ def own_substeps(
     Raises:
         SceneError: The scene does not compile.
     """
-    with quiet():
-        alone = _FileMotion.simulate(source, scene, MAX_WORK)
-        if alone is None:
-            return 1, None
-        own = _with_step(replace(setting, substeps=1), alone.step)
-        one = alone.against(scene, replace(setting, substeps=1))
-        if not one.deviations or own.substeps <= 1:
-            return 1, one
-        _, more = alone._compared(scene, own)
-    return (own.substeps, more) if more.size < one.size else (1, one)
+    one = fidelity(source, scene, replace(setting, substeps=1), max_work=MAX_WORK)
+    if one is None or not one.deviations:
+        return 1, one
+    own = _with_step(scene, setting, one.step)
+    if own.substeps <= 1:
+        return 1, one
+    more = fidelity(source, scene, own, max_work=MAX_WORK)
+    return (own.substeps, more) if more is not None and more.size < one.size else (1, one)
 
 
-def _with_step(setting: RunPoint, step: float) -> RunPoint:
+def _with_step(scene: Scene, setting: RunPoint, step: float) -> RunPoint:
     """Returns a setting whose scene has a time step in s, or as many substeps as there may be."""
     if step > (1.0 + ROUNDING) * setting.period:
         return replace(setting, period=step, substeps=1)
-    count = math.ceil(setting.period / step - ROUNDING)
-    return replace(setting, substeps=min(count, MAX_SUBSTEPS))
+    most = 1 if scene.has_several_hands else MAX_SUBSTEPS
+    return replace(setting, substeps=min(math.ceil(setting.period / step - ROUNDING), most))

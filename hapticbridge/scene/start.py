@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.scene.checks import NOTABLE_OVERLAP, listed, overlaps
+from hapticbridge.scene.checks import NOTABLE_OVERLAP, Overlap, listed, overlaps
 from hapticbridge.scene.compile import reset
 from hapticbridge.scene.treatment import SceneChange
 
@@ -23,10 +23,10 @@ VIOLATION = 1e-4
 some µm, which nothing shows. A larger value lets a run start with a constraint off by as much."""
 
 CLOSED = 1e-9
-"""Violation in m or rad at which a constraint counts as closed, so that no step follows."""
+"""Step in m or rad at which a projection ends: the constraints are closed, or cannot be."""
 
 MAX_STEPS = 100
-"""Number of steps of a projection. Closed loops take 5 to 20; those that cannot close take all."""
+"""Number of steps of a projection. Closed loops take 5 to 20; some that cannot close take all."""
 
 MAX_NAMED = 4
 """Number of joints and bodies that are named one by one. More are counted."""
@@ -40,7 +40,6 @@ _ROWS = {
     int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT): "joint",
     int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON): "tendon",
 }
-_CONTACTS = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
 _KINDS = {
     int(mujoco.mjtEq.mjEQ_CONNECT): "connect",
     int(mujoco.mjtEq.mjEQ_WELD): "weld",
@@ -75,9 +74,9 @@ def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Sta
 
     with the inertia matrix M, the constraints' Jacobian J and their violation r. Weight, springs,
     motors and friction give no force. Without them a scene's own soft constraints come to rest at
-    r = 0 too. An equality that cannot be closed is left out and described. Contacts are left out
-    if no pair overlaps by ``NOTABLE_OVERLAP``, and if with them a limit or an equality stays
-    violated or the deepest overlap does not become smaller, as of a peg within the hull of a hole.
+    r = 0 too. An equality that cannot be closed is left out and described. Contacts come last, and
+    only if pairs overlap by ``NOTABLE_OVERLAP`` then. They are left out if with them a limit or an
+    equality stays violated, or no pair comes farther apart, as of a peg within the hull of a hole.
 
     Args:
         model: Compiled scene; it is not changed.
@@ -86,12 +85,11 @@ def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Sta
     trial, data = _without_forces(model)
     start, first = data.qpos.copy(), _violations(trial, data)
     inside = overlaps(trial, data, NOTABLE_OVERLAP)
-    if not inside or not is_moved:
-        _leave_contacts(trial)
-        if max(first.values(), default=0.0) <= VIOLATION:
-            return Start(None, (), ())
-    end, last = (_projected(trial, data) if is_moved else start), first
+    if not inside and max(first.values(), default=0.0) <= VIOLATION:
+        return Start(None, (), ())
+    end, last = start, first
     if is_moved:
+        end = _projected(trial, data)
         data.eq_active[:] = model.eq_active0
         mujoco.mj_forward(trial, data)
         last = _violations(trial, data)
@@ -100,6 +98,8 @@ def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Sta
         f"{row_name(model, row)} starts {_off(model, row, still[row])}, and stays so"
         for row in still
     ]
+    if not is_moved and inside:
+        remaining.append(f"{listed(inside)} at the start, and stay so")
     words = [
         f"start of {row_name(model, row)}: {_off(model, row, size)} → closed"
         for row, size in first.items()
@@ -115,33 +115,48 @@ def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Sta
 
 
 def _projected(trial: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
-    """Returns the positions on all constraints; without those that cannot be closed."""
-    start, before = data.qpos.copy(), _depth(data)
+    """Moves onto all constraints, then apart; returns the positions.
+
+    Constraints that cannot be closed are left out.
+    """
+    start, own = data.qpos.copy(), trial.opt.disableflags
+    trial.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     for _ in range(3):
         data.qpos[:] = start
         _clamp_joints(trial, data)
-        for _ in range(MAX_STEPS):
-            mujoco.mj_forward(trial, data)
-            sizes = _violations(trial, data)
-            if max([_depth(data), *sizes.values()]) <= CLOSED or not np.isfinite(data.qacc).all():
-                break
-            mujoco.mj_integratePos(trial, data.qpos, data.qacc, 1.0)
-        if before and (max(sizes.values(), default=0.0) > VIOLATION or _depth(data) >= before):
-            _leave_contacts(trial)
-            before = 0.0
-            continue
+        sizes = _approach(trial, data)
         still = [row[1] for row, size in sizes.items() if row[0] == "equality" and size > VIOLATION]
         if not still:
             break
         data.eq_active[still] = 0
     if not np.isfinite(data.qpos).all():
         data.qpos[:] = start
+    closed = np.array(data.qpos)
+    trial.opt.disableflags = own
+    mujoco.mj_forward(trial, data)
+    if before := overlaps(trial, data, NOTABLE_OVERLAP):
+        sizes = _approach(trial, data)
+        after = overlaps(trial, data, NOTABLE_OVERLAP)
+        is_closed = max(sizes.values(), default=0.0) <= VIOLATION
+        if not is_closed or not _is_farther_apart(after, before):
+            data.qpos[:] = closed
     return np.array(data.qpos)
 
 
-def _depth(data: mujoco.MjData) -> float:
-    """Returns the depth in m of the deepest contact that a joint can answer."""
-    return float((-data.efc_pos[data.efc_type == _CONTACTS]).max(initial=0.0))
+def _approach(trial: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, int], float]:
+    """Takes steps onto the active constraints; returns what is left of each violation."""
+    for _ in range(MAX_STEPS):
+        mujoco.mj_forward(trial, data)
+        if not CLOSED < np.abs(data.qacc).max(initial=0.0) < np.inf:
+            break
+        mujoco.mj_integratePos(trial, data.qpos, data.qacc, 1.0)
+    return _violations(trial, data)
+
+
+def _is_farther_apart(after: list[Overlap], before: list[Overlap]) -> bool:
+    """Returns True if fewer pairs overlap and none deeper, or as many and less deep."""
+    deepest, limit = (max((each.depth for each in some), default=0.0) for some in (after, before))
+    return deepest < limit or (len(after) < len(before) and deepest <= limit + CLOSED)
 
 
 def _at(model: mujoco.MjModel, positions: NDArray[np.float64]) -> mujoco.MjData:
@@ -151,10 +166,6 @@ def _at(model: mujoco.MjModel, positions: NDArray[np.float64]) -> mujoco.MjData:
     data.qpos[:] = positions
     mujoco.mj_fwdPosition(model, data)
     return data
-
-
-def _leave_contacts(trial: mujoco.MjModel) -> None:
-    trial.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
 
 def _clamp_joints(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -245,15 +256,21 @@ def row_name(model: mujoco.MjModel, row: tuple[str, int]) -> str:
 
 
 def _off(model: mujoco.MjModel, row: tuple[str, int], size: float) -> str:
-    kind, number = row
+    (kind, number), eq = row, mujoco.mjtEq
+    if kind == "equality":
+        of, number = int(model.eq_type[number]), int(model.eq_obj1id[number])
+        kind = {int(eq.mjEQ_JOINT): "joint", int(eq.mjEQ_TENDON): "tendon"}.get(of, "")
+    if kind == "tendon":  # a fixed one is the sum of its joints
+        first = int(model.tendon_adr[number])
+        is_fixed = int(model.wrap_type[first]) == int(mujoco.mjtWrap.mjWRAP_JOINT)
+        kind, number = ("joint", int(model.wrap_objid[first])) if is_fixed else ("", 0)
     is_angle = kind == "joint" and int(model.jnt_type[number]) in _HINGES
-    if kind == "equality" and int(model.eq_type[number]) == int(mujoco.mjtEq.mjEQ_JOINT):
-        is_angle = int(model.jnt_type[model.eq_obj1id[number]]) in _HINGES
-    beyond = "off" if kind == "equality" else "beyond its limit"
+    beyond = "off" if row[0] == "equality" else "beyond its limit"
     return f"{_place(size, is_angle=is_angle)} {beyond}"
 
 
 def _place(value: float, *, is_angle: bool) -> str:
+    value = round(value, 8)  # finer is rounding
     shown = float(f"{np.rad2deg(value) if is_angle else 1e3 * value:.3g}")
     return f"{shown + 0.0:g} {'deg' if is_angle else 'mm'}"
 
