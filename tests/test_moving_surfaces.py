@@ -55,3 +55,17 @@ def test_belt_that_drags_the_tool_is_an_input_and_not_energy_from_nowhere(tmp_pa
     report = hb.audit(recording)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     assert "inputs did" in str(summary)
+
+
+@pytest.mark.parametrize("velocity", ["0.3 0 0 0 0 0", "0 0 0 0 0 3", "0.3 0 0 0 0 3"])
+def test_a_plate_that_drives_itself_does_not_hop(tmp_path: Path, velocity: str) -> None:
+    """Its contacts slide, though it rests; a step that took it for still threw it at 0.2 m/s."""
+    plate = """<mujoco><option timestep="0.001"/><worldbody>
+    <body name="tool" pos="0 1 1" gravcomp="1"><freejoint/><geom size=".02" mass=".1"/>
+    <site name="grip"/></body><geom type="plane" size="2 2 .1"/>
+    <body name="plate" pos="0 0 .02"><freejoint/>
+    <geom type="box" size=".2 .2 .02" mass="5" surfacevel="{0}"/></body></worldbody></mujoco>"""
+    scene, speeds = hb.load_scene(scene_file(tmp_path, plate.format(velocity))), []
+    with hb.Bridge(scene, "simulated", clock=hb.SimulatedClock()) as bridge:
+        bridge.run(0.3, lambda _: speeds.append(float(bridge.scene.data.qvel[8])))
+    assert max(map(abs, speeds)) < 0.02

@@ -667,13 +667,29 @@ def returned_energy(s: State) -> float:
 
 
 @compiled
+def _note_ends(s: State) -> None:
+    """Notes each row's velocity at the end of the step, J v⁺, against surfaces that move."""
+    mj = s.mj
+    mj_mul_jac(mj.model, mj.data, s.contact.end_velocity, mj.qvel)
+    if not mj.has_belts:
+        return
+    ends, contacts = floats(s.contact.end_velocity, MAX_ROWS), pointer_at(mj.contact)
+    for c in range(ints(mj.ncon, 1)[0]):
+        one = contacts + c * mj.contact_size
+        row = ints(one + mj.contact_row, 1)[0]
+        velocity = floats(one + mj.contact_surface_velocity, 3)
+        for j in range(min(ints(one + mj.contact_dim, 1)[0] - 1, 3) if row >= 0 else 0):
+            ends[row + 1 + j] += velocity[j]
+
+
+@compiled
 def _has_sunk(s: State) -> bool:
     """Returns True if a contact sank in the step because it slid less than at the start."""
     mj, h, contact = s.mj, s.run.timestep, s.contact
     count = ints(mj.nefc, 1)[0]
     if h * contact.lift <= SUNK or count > MAX_ROWS:
         return False
-    mj_mul_jac(mj.model, mj.data, contact.end_velocity, mj.qvel)
+    _note_ends(s)
     ends, contacts = floats(contact.end_velocity, count), pointer_at(mj.contact)
     for c in range(ints(mj.ncon, 1)[0]):
         one = contacts + c * mj.contact_size
@@ -693,7 +709,7 @@ def _misses_force(s: State) -> bool:
     count = ints(mj.nefc, 1)[0]
     if not contact.pressing or count > MAX_ROWS:
         return False
-    mj_mul_jac(mj.model, mj.data, contact.end_velocity, mj.qvel)
+    _note_ends(s)
     ends, contacts = floats(contact.end_velocity, count), pointer_at(mj.contact)
     blocked, positions = floats(contact.blocked, MAX_ROWS), floats(pointer_at(mj.efc_pos), count)
     velocities = floats(pointer_at(mj.efc_vel), count)
