@@ -390,7 +390,7 @@ def test_a_trip_by_motors_that_took_more_than_they_gave_names_them(tmp_path: Pat
     ("energy", "words"),
     [
         (HandEnergy(net=4e-3, motors=3e-3), "the scene's motors did 3 mJ of work"),
-        (HandEnergy(net=4e-3, inputs=-3e-3), "moved mocap bodies) took 3 mJ until then"),
+        (HandEnergy(net=4e-3, inputs=-3e-3), "moved mocap bodies, belts) took 3 mJ until then"),
         (HandEnergy(net=0.04, motors=0.01, inputs=0.01), "lower --stiffness"),
         (HandEnergy(net=0.0, motors=0.5 * INSTANT), "lower --stiffness"),
     ],

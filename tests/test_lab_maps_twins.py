@@ -46,7 +46,7 @@ DIFFERENCES: dict[str, dict[str, Any]] = {
 }
 """Differences of both recordings' descriptions, by map."""
 
-DERIVED = {"scene_sha256", "guard", "started", "epoch_ns"}
+DERIVED = {"scene_sha256", "scene_changes", "guard", "started", "epoch_ns"}
 """Metadata that follow from the others: the model has the integrator of a method and the time step
 of a rate, and the guard is off. The last two are the time of recording."""
 

@@ -365,6 +365,19 @@ class Scene:
         carry_over(self.model, model)
         self.model, self.data = model, mujoco.MjData(model)
 
+    def _set_diagonal(self, own: int, *, is_exact: bool) -> None:
+        """Sets the exact diagonal, which gives a weld its stiffness, or what the file's flags say.
+
+        The flags of rigid contacts have it; those that they replace are then the scene's.
+        """
+        bit, replaced = int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT), self._own_contact
+        flags = replaced["enableflags"] if replaced else self.model.opt.enableflags
+        flags = flags | bit if is_exact else (flags & ~bit) | (own & bit)
+        if replaced:
+            self._own_contact = replaced | {"enableflags": flags}
+        else:
+            self.model.opt.enableflags = flags
+
     def set_weld(self, coupling: Coupling | None) -> None:
         """Welds the grip to the handle with K and B as ``solref``; None removes the weld.
 
@@ -385,5 +398,6 @@ class Scene:
             if coupling is not None:
                 add_weld(spec, self.grip)
             self._recompile(spec)
+            self._set_diagonal(self._spec.option.enableflags, is_exact=coupling is not None)
         if coupling is not None:
             set_weld_gains(self.model, coupling)
