@@ -138,27 +138,44 @@ def test_a_delay_counts_if_it_is_longer_than_the_stated_one(
     assert ("forces follow" in report.reason) == (late > stated)
 
 
-def test_an_added_delay_that_is_no_time_is_refused_by_the_audit(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("added_delay", ("soon", -1.0, 9.0)),
+        ("axes", ("x", {"x": "left"}, {"w": "right"}, {"x": 1}, {"x": []})),
+    ],
+)
+def test_a_result_that_no_probe_gives_is_refused_by_the_audit(
+    tmp_path: Path, name: str, values: tuple[object, ...]
+) -> None:
     path, damaged = tmp_path / "run.mcap", tmp_path / "damaged.mcap"
     with opened(Wired(FINGERS), recording=path) as bridge:
         bridge.run(0.1)
-    for value in ("soon", -1.0, 9.0):
+    for value in values:
         events = [
-            each | {"added_delay": value} if each["event"] == "probe" else each
+            each | {name: value} if each["event"] == "probe" else each
             for each in hb.read_recording(path).events
         ]
         report = audit(rewritten(hb.read_recording(path), damaged, events=events))
         assert report.verdict == "invalid"
-        assert "added_delay" in report.reason
+        assert name in report.reason
 
 
-def test_a_hand_that_holds_too_firmly_is_not_judged() -> None:
+def test_a_hand_that_holds_too_firmly_is_not_judged_and_the_certificate_says_so(
+    tmp_path: Path,
+) -> None:
     """1 N moves it by 1 µm, and the encoder's step is 20 µm."""
     device = Wired((0.5, 1e6, 100.0), _reversed_y, step=2e-5, resolution=2e-5)
-    with opened(device) as bridge:
+    path = tmp_path / "run.mcap"
+    with opened(device, recording=path) as bridge:
         summary = bridge.run(0.3)
     assert summary.probe == "x, y, z gave no clear answer"
     assert device.gained <= 1e-3
+    said = "; if x, y, z push the right way, the probe could not tell"
+    assert said in summary.certification.words
+    judged = audit(path).certification
+    assert judged is not None
+    assert said in judged.words
 
 
 @pytest.mark.parametrize(

@@ -20,9 +20,9 @@ from hapticbridge.demand.certificate import conditions_of
 from hapticbridge.demand.loop_setting import LoopSetting, delay_ticks
 from hapticbridge.demand.methods import Method, RunCoupling
 from hapticbridge.demand.probe import EVENT as PROBE_EVENT
-from hapticbridge.demand.probe import MAX_DELAY
-from hapticbridge.device import DeviceInfo
-from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.demand.probe import MAX_DELAY, Direction
+from hapticbridge.device import AXES, DeviceInfo
+from hapticbridge.errors import HapticBridgeError, RecordingError, choices
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.recording import RecordingFile
@@ -46,6 +46,7 @@ class RunEvents:
         resets: Ticks before which the scene was reset.
         couplings: Couplings of the law (K and B') in order, the initial one first.
         added_delay: Delay in s that the probe found beyond the stated one.
+        unanswered: Axes of which the probe could not tell the direction, by name.
     """
 
     parameters: RunParameters
@@ -55,6 +56,7 @@ class RunEvents:
     resets: Array
     couplings: tuple[Coupling, ...]
     added_delay: float
+    unanswered: str
     _began: Array
     _switched: tuple[Array, NDArray[np.int64]]
 
@@ -86,6 +88,7 @@ class RunEvents:
                 *(coupling_in(event, parameters) for event in by_name["coupling"]),
             ),
             added_delay=max(map(_added_delay, by_name[PROBE_EVENT]), default=0.0),
+            unanswered=", ".join(filter(None, map(_unanswered, by_name[PROBE_EVENT]))),
             _began=ticks["coupling"],
             _switched=(
                 ticks["switch"],
@@ -216,6 +219,17 @@ def _added_delay(event: Mapping[str, Any]) -> float:
             f"event '{PROBE_EVENT}' has added_delay {shown(delay)}; it must be 0 to {MAX_DELAY} s"
         )
     return float(delay)
+
+
+def _unanswered(event: Mapping[str, Any]) -> str:
+    given, known = event.get("axes"), [each.value for each in Direction]
+    axes = given if isinstance(given, dict) else {"": ""}
+    if not axes.keys() <= set(AXES) or not all(each in known for each in axes.values()):
+        raise RecordingError(
+            f"event '{PROBE_EVENT}' has axes {shown(given)}; it must give the direction of each "
+            f"axis: {choices(known)}"
+        )
+    return ", ".join(name for name, each in axes.items() if each == Direction.UNKNOWN)
 
 
 def _gains(coupling: Coupling) -> tuple[float, ...]:

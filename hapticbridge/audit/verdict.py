@@ -560,6 +560,7 @@ class JudgedDevice:
             scene_silence=run.parameters.period * timing.longest_silence,
             silence=timing.silence,
             silent_tick=timing.silent_tick,
+            unanswered=run.events.unanswered,
         )
         certification = certification_of(run.info, run.worst, run.method, times, energy)
         self.certification = certification

@@ -81,6 +81,7 @@ class Certification:
         energy: Energy that the hand got and what paid for it.
         is_borne: True if the device meets its conditions with every tick in time.
         law_evaluations: Evaluations of the law per tick.
+        unanswered: Axes of which the probe could not tell the direction, by name.
     """
 
     standing: Standing
@@ -89,6 +90,7 @@ class Certification:
     energy: HandEnergy
     is_borne: bool
     law_evaluations: int = 1
+    unanswered: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Returns standing, time and energy by name, for JSON."""
@@ -125,6 +127,7 @@ class Certification:
             open_steps = next((each for each in steps if each.holds is None), None)
             limits = "" if open_steps is None else f"; its encoder's steps are {open_steps.word}"
             limits += f", but {self.energy.limit}" if self.energy.limit else ""
+            limits += self._untold
             return f"device certified{self.kept.clause}: b >= {self._bound}{self._if}{limits}"
         if self.verdict is None:
             return f"device not judged: {_OPEN[self.standing]}{self.kept.slowness}"
@@ -170,6 +173,13 @@ class Certification:
         return min(timed, key=lambda each: each.unconfirmed_delay or 0.0).clause if timed else ""
 
     @property
+    def _untold(self) -> str:
+        """Clause on axes of which no probe has told the direction."""
+        if not self.unanswered:
+            return ""
+        return f"; if {self.unanswered} push the right way, the probe could not tell"
+
+    @property
     def fact(self) -> str:
         """Verdict as a value in a table of facts."""
         if self.verdict is None:
@@ -185,7 +195,7 @@ class Certification:
             clause = f",{self.kept.clause}" if self.kept.clause else ""
             clause += self._if
             limit = f"; but {self.energy.limit}" if self.energy.limit else ""
-            return f"The device bears this coupling, in any hand{clause}{limit}."
+            return f"The device bears this coupling, in any hand{clause}{limit}{self._untold}."
         if self.standing is Standing.NO_HAND:
             return f"The device {_NO_HAND}."
         if self.verdict is None:
@@ -231,7 +241,13 @@ def certification_of(
     else:
         standing = Standing.TRIPPED if times.has_tripped else Standing.CERTIFIED
     return Certification(
-        standing, conditions, kept, energy, verdict is True, parameters.law_evaluations
+        standing,
+        conditions,
+        kept,
+        energy,
+        verdict is True,
+        parameters.law_evaluations,
+        times.unanswered,
     )
 
 

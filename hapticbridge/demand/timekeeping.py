@@ -69,6 +69,7 @@ class RunTimes:
         scene_silence: Longest time in s without a new one.
         silence: Longest time in s without a new sample of the device.
         silent_tick: Last tick of that time.
+        unanswered: Axes of which the probe could not tell the direction, by name.
     """
 
     ticks: int
@@ -85,6 +86,7 @@ class RunTimes:
     scene_silence: float = 0.0
     silence: float = 0.0
     silent_tick: int = 0
+    unanswered: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from hapticbridge.demand.certification import (
 )
 from hapticbridge.demand.loop_setting import fresh_share
 from hapticbridge.demand.methods import Method, RunCoupling, default_method, method_named
-from hapticbridge.demand.probe import Probed
+from hapticbridge.demand.probe import Direction, Probed
 from hapticbridge.demand.timekeeping import RunTimes, Timekeeping
 from hapticbridge.demand.trip import Trip
 from hapticbridge.device import DeviceInfo
@@ -462,6 +462,7 @@ class Summary:
             scene_silence=parameters.period * int(state["shown"]["longest_silence"][0]),
             silence=float(state["guard"]["longest_silence"][0]),
             silent_tick=int(state["guard"]["silent_tick"][0]),
+            unanswered=outcome.probed.axes(Direction.UNKNOWN) if outcome.probed else "",
         )
         peaks: dict[str, Any] = {name: float(state["loop"][name][0]) for name in _PEAKS}
         hand = HandEnergy() if info.is_prescribed else hand_energy(state, parameters)
