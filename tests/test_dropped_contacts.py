@@ -110,7 +110,8 @@ def test_memory_of_gigabytes_is_reduced_and_the_run_can_be_audited(
     tmp_path: Path, size: str
 ) -> None:
     path, recording = tmp_path / "scene.xml", tmp_path / "run.mcap"
-    path.write_text(PLATE.format(f" {size}"))
+    text = PLATE.format(f" {size}").replace('<site name="grip"/>', "")  # the body is the grip
+    path.write_text(text.replace('<body pos="0 0 0.033">', '<body name="grip" pos="0 0 0.033">'))
     run(path, recording)
     scene = load_scene(path)
     assert scene.model.narena == 128 << 20

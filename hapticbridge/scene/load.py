@@ -269,6 +269,7 @@ def plain_model(source: SceneSource) -> mujoco.MjModel:
     An integrator that MuJoCo refuses for this scene is replaced, as the bridge does.
     """
     spec = source.spec.copy()
+    _limit_memory(spec)
     with suppress(ValueError):
         return _compiled(spec)[0]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
@@ -276,14 +277,18 @@ def plain_model(source: SceneSource) -> mujoco.MjModel:
         return _compiled(spec)[0]
 
 
-def _compiled(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, tuple[SceneChange, ...]]:
-    """Compiles a scene with a memory within its limits; returns the model and the change."""
+def _limit_memory(spec: mujoco.MjSpec) -> tuple[SceneChange, ...]:
+    """Reduces a memory beyond ``MAX_MEMORY``, before MuJoCo reserves it to compile."""
     before, rows = spec.memory, max(spec.njmax, spec.nconmax)
-    if before > MAX_MEMORY or rows > MAX_ROWS:  # before MuJoCo itself reserves it to compile
-        spec.memory, spec.nstack, spec.njmax, spec.nconmax = MAX_MEMORY, -1, -1, -1
-        asked = format_si(before, "B") if before > MAX_MEMORY else f"for {rows} rows"
-        change = SceneChange(f"memory: {asked} → {format_si(MAX_MEMORY, 'B')}", "memory")
-        return spec.compile(), (change,)
+    if before <= MAX_MEMORY and rows <= MAX_ROWS:
+        return ()
+    spec.memory, spec.nstack, spec.njmax, spec.nconmax = MAX_MEMORY, -1, -1, -1
+    asked = format_si(before, "B") if before > MAX_MEMORY else f"for {rows} rows"
+    return (SceneChange(f"memory: {asked} → {format_si(MAX_MEMORY, 'B')}", "memory"),)
+
+
+def _compiled(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, tuple[SceneChange, ...]]:
+    """Compiles a scene with the least memory or more; returns the model and the change."""
     model = spec.compile()
     if model.narena >= MIN_MEMORY:
         return model, ()
@@ -339,7 +344,7 @@ def compile_scene(
     if not grips:
         raise SceneError(f"no grip is named for scene '{path}'; name one per hand")
     refuse_callbacks()
-    changes = set_options(spec, as_is=as_is)
+    changes = (*set_options(spec, as_is=as_is), *_limit_memory(spec))
     with _refused(path):
         about_grip = [said for each in grips for said in add_grip(spec, each)]
     attach_handles(spec, grips)
