@@ -248,7 +248,7 @@ def check_options(spec: mujoco.MjSpec) -> None:
         )
 
 
-_CALLBACKS = ("act_bias", "act_dyn", "act_gain", "contactfilter", "control", "passive", "time")
+_CALLBACKS = ("act_bias", "act_dyn", "act_gain", "contactfilter", "control", "passive")
 
 
 def refuse_callbacks() -> None:
