@@ -324,3 +324,12 @@ def test_a_device_without_a_condition_is_told_why(call: Called, tmp_path: Path) 
     ticks["kinetic"][50] += 1.0
     out = call("audit", rewritten(recording, tmp_path / "bad.mcap", ticks=ticks))[1]
     assert "invalid" in out and prescribed not in out and unknown not in out
+
+
+def test_a_link_to_itself_is_told_as_a_file_that_cannot_be_read(
+    call: Called, tmp_path: Path
+) -> None:
+    (tmp_path / "loop.mcap").symlink_to(tmp_path / "loop.mcap")
+    code, _, err = call("audit", tmp_path / "loop.mcap")
+    assert code == 2
+    assert "cannot read the recording" in err

@@ -469,14 +469,15 @@ def test_existing_recording_is_kept_unless_overwriting_is_asked_for(
     call: Called, tmp_path: Path
 ) -> None:
     path = tmp_path / "run.mcap"
-    path.write_text("precious")
+    precious = b"\x89MCAP0\r\nprecious"
+    path.write_bytes(precious)
     command = ("run", "point_mass", "--fast", "--duration", 0.01, "--record", path)
     code, _, err = call(*command)
     assert code == 2
     assert "--overwrite" in one_sentence(err)
-    assert path.read_text() == "precious"
+    assert path.read_bytes() == precious
     assert call(*command, "--duration", "nan", "--overwrite")[0] == 2
-    assert path.read_text() == "precious"
+    assert path.read_bytes() == precious
     assert call(*command, "--overwrite")[0] == 0
     assert audit(path).verdict == "passive"
 
@@ -486,3 +487,40 @@ def test_a_device_that_does_not_turn_has_no_rotational_coupling_in_the_text(call
         device = f"simulated:dof={dof}"
         _, _, err = call("run", "point_mass", "--device", device, "--fast", "--duration", 0.05)
         assert ("K_r = " in err) == is_told
+
+
+@pytest.mark.parametrize(
+    ("name", "device"), [("scene.xml", "simulated"), ("motion.csv", "trajectory:{}")]
+)
+def test_a_file_that_is_no_recording_is_never_replaced_by_one(
+    call: Called, tmp_path: Path, name: str, device: str
+) -> None:
+    path = tmp_path / name
+    content = "t,x,y,z\n0,0,0,0\n1,0,0,0\n" if name.endswith("csv") else "<mujoco/>"
+    path.write_text(content)
+    options = ("--fast", "--duration", "0.1", "--device", device.format(path))
+    code, _, err = call("run", "point_mass", *options, "--record", path, "--overwrite")
+    assert code == 2
+    assert "choose another file" in err
+    assert path.read_text() == content
+
+
+def test_a_recording_is_replaced_but_not_by_a_run_that_follows_it(
+    call: Called, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    options = ("run", "point_mass", "--fast", "--duration", "0.1", "--record", path, "--overwrite")
+    assert call(*options)[0] == 0
+    before = path.read_bytes()
+    code, _, err = call(*options, "--device", f"trajectory:{path}")
+    assert code == 2
+    assert "is the motion of the run" in err
+    assert path.read_bytes() == before
+    assert call(*options)[0] == 0
+
+
+@pytest.mark.parametrize("duration", ["1e306", "1e12"])
+def test_a_duration_without_end_is_refused(call: Called, duration: str) -> None:
+    code, _, err = call("run", "point_mass", "--fast", "--duration", duration)
+    assert code == 2
+    assert "at most 1e+09" in err

@@ -172,3 +172,11 @@ def test_a_slow_walk_and_a_few_rows_are_no_mistake(tmp_path: Path) -> None:
     assert read_motion(tmp_path / "hand.csv").duration == 18
     (tmp_path / "hand.csv").write_text(table(1, 1))
     assert read_motion(tmp_path / "hand.csv").duration == pytest.approx(0.29)
+
+
+@pytest.mark.parametrize("text", ["0_1", "٠.٠١"])
+def test_numbers_in_another_notation_are_refused_at_their_line(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "motion.csv"
+    path.write_text(f"t,x,y,z\n0,0,0,0\n1,{text},0,0\n", encoding="utf-8")
+    with pytest.raises(DeviceError, match=r"line 3: column 'x' holds .* not a number"):
+        open_device(f"trajectory:{path}")

@@ -12,6 +12,7 @@ from outside_scenes import scene_file
 import hapticbridge as hb
 from hapticbridge.scene import load_scene
 from hapticbridge.scene.scene import Scene
+from hapticbridge.scene.start import row_name
 
 TOOL = """<body name="tool" pos=".5 0 .1"><freejoint/>
   <geom type="box" size=".02 .02 .02" mass=".1"/><site name="grip"/></body>"""
@@ -375,3 +376,11 @@ def test_start_out_of_the_table_is_where_the_scenes_own_contacts_push_it(tmp_pat
     mujoco.mj_step(model, data, 2000)
     rest = scene.data.body("cup").xpos
     assert rest == pytest.approx(data.body("cup").xpos, abs=1e-3)
+
+
+def test_a_constraint_of_a_flex_has_a_name(tmp_path: Path) -> None:
+    rope = """<flexcomp name="rope" type="grid" count="3 1 1" spacing=".1 .1 .1" dim="1" mass=".1"
+      pos="0 0 1" radius=".01"><edge equality="true"/></flexcomp>"""
+    model = load_scene(scene_file(tmp_path, scene_text(rope))).model
+    (equality,) = np.flatnonzero(model.eq_type == int(mujoco.mjtEq.mjEQ_FLEX))
+    assert row_name(model, ("equality", int(equality))).startswith("equality '")

@@ -244,7 +244,10 @@ def find_recordings(words: Iterable[str | Path]) -> list[Path]:
             if not files:
                 raise RecordingError(f"no recording matches '{path}'")
         for file in files:
-            found.setdefault(file.resolve(), file)
+            try:
+                found.setdefault(file.resolve(), file)
+            except RuntimeError:  # a link to itself, of which reading says more
+                found.setdefault(file.absolute(), file)
     return list(found.values())
 
 

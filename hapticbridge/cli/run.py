@@ -337,6 +337,11 @@ class Run:
     as_json: bool = option(False, flag="json")
     """Print the summary as JSON."""
 
+    def _is_recording(self, file: Path) -> bool:
+        """Returns True if a file is the one that the run would write."""
+        record = self.record
+        return record is not None and file.exists() and record.exists() and file.samefile(record)
+
     def execute(self) -> int:
         """Runs the bridge; returns the exit code."""
         if self.overwrite and self.record is None:
@@ -345,6 +350,10 @@ class Run:
             )
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
+        for named in (self.device, *self.hand):
+            file = named.partition("trajectory:")[2].partition(":/")[0]
+            if file and self._is_recording(Path(file)):
+                raise RecordingError(f"'{file}' is the motion of the run; choose another file")
         clock = SimulatedClock() if self.fast else RealClock()
         if self.hand and (self.grip != "grip" or self.device != "simulated"):
             raise HapticBridgeError("--hand GRIP=DEVICE takes the place of --grip and --device")

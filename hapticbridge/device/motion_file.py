@@ -69,7 +69,7 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
                 f"{width} columns"
             )
         try:
-            values.extend([float(fields[column]) for column in columns])
+            values.extend([_value(fields[column]) for column in columns])
         except ValueError:
             column = next(i for i in columns if not _is_number(fields[i]))
             raise DeviceError(
@@ -145,9 +145,20 @@ def _column_names(where: str, line: str) -> list[str]:
     return names
 
 
+def _value(text: str) -> float:
+    """Returns a number in plain notation; Python also reads ``0_1`` and other scripts' digits.
+
+    Raises:
+        ValueError: The text is none.
+    """
+    if "_" in text or not text.isascii():
+        raise ValueError(text)
+    return float(text)
+
+
 def _is_number(text: str) -> bool:
     try:
-        float(text)
+        _value(text)
     except ValueError:
         return False
     return True

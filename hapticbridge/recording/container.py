@@ -166,6 +166,15 @@ class Fields:
 MAGIC = MCAP0_MAGIC
 """First and last bytes of an MCAP file."""
 
+
+def may_be_replaced(path: Path) -> bool:
+    """Returns False for a file that has content and is no MCAP file, such as a scene."""
+    if not path.is_file():
+        return True
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) in (b"", MAGIC)
+
+
 MAX_CHUNK_SIZE = 1 << 22
 """Largest chunk in bytes that is decompressed; a damaged size must not exhaust memory. The recorder
 writes 128 kB."""

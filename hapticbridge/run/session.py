@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.arguments import is_number, shown
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, slept_ns
 from hapticbridge.coupling import Coupling
 from hapticbridge.dataclass_json import to_json
@@ -74,6 +75,9 @@ from hapticbridge.scene import Scene
 from hapticbridge.scene.checks import first_pump, strongest_actuator
 from hapticbridge.scene.inputs import Write
 from hapticbridge.signals import deferring_stops
+
+LONGEST = 1e9
+"""Longest run in s, 30 years: beyond it numbers of ticks are too large to count."""
 
 SUSPENDED_NS = 50_000_000
 """Longest sleep of the machine in ns that a run survives. After a longer one the state of hand and
@@ -492,8 +496,10 @@ class Session:
             HapticBridgeError: The duration is not finite and > 0.
         """
         period = self.setup.period
-        if duration is not None and (not np.isfinite(duration) or duration <= 0):
-            raise HapticBridgeError(f"duration is {duration!r} s; it must be finite and > 0")
+        if duration is not None and not (is_number(duration) and 0.0 < duration <= LONGEST):
+            raise HapticBridgeError(
+                f"duration is {shown(duration)} s; it must be a number > 0, at most {LONGEST:g}"
+            )
         if not self.tick:
             self._start_potential = float(self.kernel.state["energy"]["potential"][0])
         self._is_timed = duration is not None

@@ -242,6 +242,8 @@ def row_name(model: mujoco.MjModel, row: tuple[str, int]) -> str:
     kind, number = row
     if kind != "equality":
         return f"{kind} '{getattr(model, kind)(number).name or number}'"
+    if int(model.eq_type[number]) not in _KINDS:  # of a flex
+        return f"equality '{model.equality(number).name or number}'"
     kind = _KINDS[int(model.eq_type[number])]
     of = kind.removesuffix(" equality")
     if of == kind:
