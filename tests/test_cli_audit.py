@@ -333,3 +333,17 @@ def test_a_link_to_itself_is_told_as_a_file_that_cannot_be_read(
     code, _, err = call("audit", tmp_path / "loop.mcap")
     assert code == 2
     assert "cannot read the recording" in err
+
+
+@pytest.mark.filterwarnings("ignore:.*wind")
+def test_wind_is_the_cause_that_an_audit_names(call: Called, tmp_path: Path) -> None:
+    scene, recording = tmp_path / "windy.xml", tmp_path / "run.mcap"
+    scene.write_text(
+        '<mujoco><option wind="3 0 0" density="1000" gravity="0 0 0"/><worldbody><body name="t">'
+        '<freejoint/><geom size=".02" mass=".1"/><site name="grip"/></body></worldbody></mujoco>'
+    )
+    assert call("run", scene, "--fast", "--duration", 0.5, "--record", recording)[0] == 1
+    _, out, _ = call("audit", recording)
+    words = " ".join(out.split())
+    assert "likely cause: unmetered work. wind does work on the scene" in words
+    assert "what to change: remove wind, or make it weaker" in words

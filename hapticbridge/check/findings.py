@@ -20,7 +20,7 @@ from hapticbridge.check.run_faults import run_faults
 from hapticbridge.errors import choices
 from hapticbridge.run.fidelity import fidelity
 from hapticbridge.scene import compile_scene
-from hapticbridge.scene.checks import first_pump, unmetered_work
+from hapticbridge.scene.checks import MAY_BE_ACTIVE, first_pump, unmetered_work
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.fault import Fault
 from hapticbridge.scene.first_faults import (
@@ -63,7 +63,7 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             )
     for name, concern in unmetered_work(case.model).items():
         place = places.with_attribute(name) or places.option(name)
-        yield Fault("unmetered work", place, concern, f"remove {name}")
+        yield Fault("unmetered work", place, concern + MAY_BE_ACTIVE, f"remove {name}")
 
 
 def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:

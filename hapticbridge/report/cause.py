@@ -27,7 +27,7 @@ from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.run.commands import UNITS
-from hapticbridge.scene.checks import first_pump
+from hapticbridge.scene.checks import first_pump, unmetered_work
 from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
 from hapticbridge.theory.bounds import NEEDED_SHARE
 from hapticbridge.units import format_energy
@@ -41,6 +41,7 @@ Kind = Literal[
     "rate",
     "damping",
     "quantisation",
+    "unmetered work",
     "unknown",
 ]
 
@@ -292,10 +293,8 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
             "damps their contacts and welds against rest, so a fast move creates energy",
             "move them slower",
         )
-    pump = None if evidence.model is None else first_pump(evidence.model)
-    # a motor's work is no creation, until its motion is beyond all measure
-    if pump is not None and (pump.kind == "joint" or report.trip is not None):
-        return Cause("pump", f"{pump.words}; {where}", f"write {pump.change}")
+    if cause := _cause_of_scene(evidence, report, where):
+        return cause
     if share < MOST:
         return _cause_without_contact(evidence, window, where)
     if concerns := _concerns(evidence, pairs):
@@ -305,6 +304,22 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
         return _method_cause(method, "the contacts are set as recommended; ")
     hard = "a light tool on a stiff coupling is the hard case"
     return Cause("contact setting", f"{where}; {hard}", _SOFTER)
+
+
+def _cause_of_scene(evidence: Evidence, report: AuditReport, where: str) -> Cause | None:
+    """Returns what the scene itself does beside any contact: a pump, or work without a port."""
+    model = evidence.model
+    if model is None:
+        return None
+    pump = first_pump(model)
+    # a motor's work is no creation, until its motion is beyond all measure
+    if pump is not None and (pump.kind == "joint" or report.trip is not None):
+        return Cause("pump", f"{pump.words}; {where}", f"write {pump.change}")
+    found = [
+        Cause("unmetered work", f"{clause}; {where}", f"remove {name}, or make it weaker")
+        for name, clause in unmetered_work(model).items()
+    ]
+    return found[0] if found else None
 
 
 def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cause:

@@ -266,20 +266,25 @@ def refuse_callbacks() -> None:
             )
 
 
+MAY_BE_ACTIVE = "; the audit may report the environment as active"
+"""Clause on what follows from unmetered work, for a sentence before the run."""
+
+
 def unmetered_work(model: mujoco.MjModel) -> dict[str, str]:
     """Returns what does work on a compiled scene that no port meters.
 
     Returns:
-        A sentence for each attribute or element that does it, by its name.
+        A clause for each attribute or element that does it, by its name.
     """
     found = dict[str, str]()
-    active = "that no port meters; the audit may report the environment as active"
     if np.any(model.opt.wind):
-        found["wind"] = f"wind does work on the scene {active}"
+        found["wind"] = "wind does work on the scene that no port meters"
     if np.any(model.geom_adhesion) or np.any(model.pair_adhesion):
-        found["adhesion"] = f"adhesion that pulls across a gap does work on the scene {active}"
+        found["adhesion"] = (
+            "adhesion that pulls across a gap does work on the scene that no port meters"
+        )
     if np.any(model.body_plugin >= 0):
-        found["plugin"] = f"the plugin of a body may do work on the scene {active}"
+        found["plugin"] = "the plugin of a body may do work on the scene that no port meters"
     return found
 
 

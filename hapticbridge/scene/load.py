@@ -15,6 +15,7 @@ import mujoco
 from hapticbridge.arguments import shown
 from hapticbridge.errors import SceneError, SceneWarning, choices, nearest
 from hapticbridge.scene.checks import (
+    MAY_BE_ACTIVE,
     check_model,
     check_numbers,
     check_options,
@@ -353,7 +354,8 @@ def compile_scene(
         changes += sized
         if not as_is and (excluded := exclude_nested(spec, model, grips[0])):
             changes, model = changes + excluded, spec.compile()
-        concerns = [*unmetered_work(model).values(), *about_grip]
+        concerns = [each + MAY_BE_ACTIVE for each in unmetered_work(model).values()]
+        concerns += about_grip
         for each in dict.fromkeys(grips):
             check_model(model, each)
         for each in dict.fromkeys(grips):
