@@ -503,3 +503,10 @@ def test_control_so_large_that_mujoco_ignores_all_controls_is_refused(tmp_path: 
         else:
             with pytest.raises(hb.SceneError, match=r"'m'.* up to 1e\+10"):
                 input_writes(scene.model, ctrl={"m": value})
+
+
+@pytest.mark.parametrize("option", ["gravity='0 0 -inf'", "density='inf'", "wind='inf 0 0'"])
+def test_an_option_that_is_not_finite_is_named(tmp_path: Path, option: str) -> None:
+    name = option.partition("=")[0]
+    message = refusal_of(tmp_path, mjcf(f"<option {option}/>"))
+    assert f"{name} in <option> is not finite; write a number" in message

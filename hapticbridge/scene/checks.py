@@ -238,9 +238,12 @@ def check_options(spec: mujoco.MjSpec) -> None:
     """Refuses options that are incompatible with the coupling.
 
     Raises:
-        SceneError: An option has state that is not saved (ipc).
+        SceneError: An option has state that is not saved (ipc), or is not finite.
     """
     option = spec.option
+    for name in ("timestep", "gravity", "wind", "magnetic", "density", "viscosity"):
+        if not np.all(np.isfinite(getattr(option, name))):
+            raise SceneError(f"{name} in <option> is not finite; write a number")
     if option.enableflags & mujoco.mjtEnableBit.mjENBL_IPC:
         raise SceneError(
             "the scene enables flag ipc, whose state cannot be saved and simulated again; "
