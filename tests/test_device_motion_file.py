@@ -108,9 +108,11 @@ def test_a_bag_that_is_no_motion_is_refused_with_what_it_holds(tmp_path: Path) -
     )
     with pytest.raises(DeviceError, match=r"message 3 of /hand: time 0 s after 0\.02 s"):
         open_device(f"trajectory:{file}")
-    (file,) = bag(tmp_path / "torn", {"/hand": [(0, ramp()[0][1][:40])]}).glob("*.mcap")
-    with pytest.raises(DeviceError, match="message 0 of /hand cannot be read"):
-        open_device(f"trajectory:{file}")
+    for length in (0, 1, 3, 40):
+        torn = {"/hand": [(0, ramp()[0][1][:length])]}
+        (file,) = bag(tmp_path / f"torn{length}", torn).glob("*.mcap")
+        with pytest.raises(DeviceError, match="message 0 of /hand cannot be read"):
+            open_device(f"trajectory:{file}")
 
 
 def test_big_endian_poses_are_read(tmp_path: Path) -> None:

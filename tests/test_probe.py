@@ -171,7 +171,7 @@ def test_a_hand_that_holds_too_firmly_is_not_judged_and_the_certificate_says_so(
         summary = bridge.run(0.3)
     assert summary.probe == "x, y, z gave no clear answer"
     assert device.gained <= 1e-3
-    said = "; if x, y, z push the right way, the probe could not tell"
+    said = "; the probe could not tell if x, y, z push the right way"
     assert said in summary.certification.words
     judged = audit(path).certification
     assert judged is not None

@@ -222,11 +222,14 @@ def _added_delay(event: Mapping[str, Any]) -> float:
 
 
 def _unanswered(event: Mapping[str, Any]) -> str:
-    given, known = event.get("axes"), [each.value for each in Direction]
-    axes = given if isinstance(given, dict) else {"": ""}
-    if not axes.keys() <= set(AXES) or not all(each in known for each in axes.values()):
+    axes, known = event.get("axes"), [each.value for each in Direction]
+    if (
+        not isinstance(axes, dict)
+        or not axes.keys() <= set(AXES)
+        or not all(each in known for each in axes.values())
+    ):
         raise RecordingError(
-            f"event '{PROBE_EVENT}' has axes {shown(given)}; it must give the direction of each "
+            f"event '{PROBE_EVENT}' has axes {shown(axes)}; it must give the direction of each "
             f"axis: {choices(known)}"
         )
     return ", ".join(name for name, each in axes.items() if each == Direction.UNKNOWN)

@@ -30,6 +30,7 @@ from hapticbridge.scene.first_faults import (
     pump_faults,
     unit_faults,
 )
+from hapticbridge.scene.treatment import Treatment
 
 # Faults of options, start, and motion without a hand
 
@@ -59,11 +60,20 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
                 "changed",
                 places.option("integrator"),
                 f"the scene runs with a change, {change}, because {change.treatment.why}",
-                "run --as-is, which refuses the scene",
+                _instead(change.treatment),
             )
     for name, concern in unmetered_work(case.model).items():
         place = places.with_attribute(name) or places.option(name)
         yield Fault("unmetered work", place, concern + MAY_BE_ACTIVE, f"remove {name}")
+
+
+def _instead(treatment: Treatment) -> str:
+    """Returns how a run goes without a change, or how the change is no news."""
+    if treatment.is_rigid:
+        return "run with --contact scene, which keeps it"
+    if treatment.stops:
+        return "run --as-is, which refuses the scene"
+    return "the new value in the file, where this line is then left out"
 
 
 def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:

@@ -45,6 +45,7 @@ from hapticbridge.device.trajectory import DEFAULT_SECONDS
 from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, choices
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
+from hapticbridge.recording.container import refuse_replacing
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.fidelity import own_substeps
 from hapticbridge.run.hands import Grasp, GripAxis, check_grasps
@@ -337,10 +338,15 @@ class Run:
     as_json: bool = option(False, flag="json")
     """Print the summary as JSON."""
 
-    def _is_recording(self, file: Path) -> bool:
-        """Returns True if a file is the one that the run would write."""
-        record = self.record
-        return record is not None and file.exists() and record.exists() and file.samefile(record)
+    def _check_overwriting(self, record: Path) -> None:
+        """Refuses a file that was not to be replaced, no recording, or the motion of the run."""
+        if not self.overwrite:
+            raise RecordingError(f"'{record}' exists; choose another file or add --overwrite")
+        refuse_replacing(record)
+        for named in (self.device, *self.hand):
+            motion = Path(named.partition("trajectory:")[2].partition(":/")[0])
+            if motion.is_file() and motion.samefile(record):
+                raise RecordingError(f"'{motion}' is the motion of the run; choose another file")
 
     def execute(self) -> int:
         """Runs the bridge; returns the exit code."""
@@ -348,12 +354,8 @@ class Run:
             raise HapticBridgeError(
                 "--overwrite goes with --record FILE; nothing would be recorded"
             )
-        if self.record is not None and self.record.exists() and not self.overwrite:
-            raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
-        for named in (self.device, *self.hand):
-            file = named.partition("trajectory:")[2].partition(":/")[0]
-            if file and self._is_recording(Path(file)):
-                raise RecordingError(f"'{file}' is the motion of the run; choose another file")
+        if self.record is not None and self.record.exists():
+            self._check_overwriting(self.record)
         clock = SimulatedClock() if self.fast else RealClock()
         if self.hand and (self.grip != "grip" or self.device != "simulated"):
             raise HapticBridgeError("--hand GRIP=DEVICE takes the place of --grip and --device")

@@ -174,10 +174,10 @@ class Certification:
 
     @property
     def _untold(self) -> str:
-        """Clause on axes of which no probe has told the direction."""
+        """Clause on axes of which the probe could not tell the direction."""
         if not self.unanswered:
             return ""
-        return f"; if {self.unanswered} push the right way, the probe could not tell"
+        return f"; the probe could not tell if {self.unanswered} push the right way"
 
     @property
     def fact(self) -> str:

@@ -179,6 +179,7 @@ MAX_STEP = 0.5
 """Median time in s between rows above which the times of many rows are taken for ms."""
 
 MANY_ROWS = 20
+"""Number of rows from which on their times are judged. Fewer may be single poses, s apart."""
 
 
 def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
@@ -212,6 +213,9 @@ def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
 # Bag of ROS 2
 
 POSE = "geometry_msgs/msg/PoseStamped"
+
+_DAMAGED = ValueError, RuntimeError, EOFError
+"""Errors besides its own with which the package mcap meets a damaged file."""
 
 
 def is_bag(path: Path) -> bool:
@@ -264,7 +268,7 @@ def read_bag(path: Path, topic: str = "") -> Motion:
                 stamps.append(stamp)
                 logged.append(message.log_time)
                 numbers.append(pose)
-        except (McapError, struct.error, ValueError, RuntimeError, EOFError) as error:
+        except (McapError, struct.error, LookupError, *_DAMAGED) as error:
             reason = str(error) or type(error).__name__
             raise DeviceError(
                 f"{path}: message {len(stamps)} of {topic} cannot be read ({reason})"
@@ -292,7 +296,7 @@ def _topics(path: Path) -> Iterator[tuple[str, str]]:
     try:
         with path.open("rb") as file:
             summary = make_reader(file).get_summary()
-    except (OSError, McapError, struct.error, ValueError, RuntimeError, EOFError) as error:
+    except (OSError, McapError, struct.error, *_DAMAGED) as error:
         raise DeviceError(f"{path}: cannot be read ({error})") from None
     if summary is None:
         raise DeviceError(f"{path}: the end of the file is missing")

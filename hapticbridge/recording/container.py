@@ -167,12 +167,19 @@ MAGIC = MCAP0_MAGIC
 """First and last bytes of an MCAP file."""
 
 
-def may_be_replaced(path: Path) -> bool:
-    """Returns False for a file that has content and is no MCAP file, such as a scene."""
+def refuse_replacing(path: Path) -> None:
+    """Refuses to replace a file that has content and is no MCAP file, such as a scene.
+
+    Raises:
+        RecordingError: Names the file.
+    """
     if not path.is_file():
-        return True
+        return
     with path.open("rb") as file:
-        return file.read(len(MAGIC)) in (b"", MAGIC)
+        if file.read(len(MAGIC)) not in (b"", MAGIC):
+            raise RecordingError(
+                f"'{path}' exists and is no recording, so it is not replaced; choose another file"
+            )
 
 
 MAX_CHUNK_SIZE = 1 << 22

@@ -413,12 +413,17 @@ def _sensors(path: Path, worker: Worker) -> dict[str, Any]:
 
 
 def _sensor_names(model: mujoco.MjModel) -> list[str]:
-    """Returns a name of each number that a scene's sensors give."""
-    return [
-        f"{model.sensor(sensor).name or sensor}{f'_{k}' if size > 1 else ''}"
-        for sensor, size in enumerate(model.sensor_dim.tolist())
-        for k in range(size)
-    ]
+    """Returns a name of each number that a scene's sensors give, all different.
+
+    None has a slash, which separates groups in HDF5.
+    """
+    names: list[str] = []
+    for sensor, size in enumerate(model.sensor_dim.tolist()):
+        name = (model.sensor(sensor).name or str(sensor)).replace("/", "_")
+        for number in [f"{name}_{k}" for k in range(size)] if size > 1 else [name]:
+            count = sum(each.partition("~")[0] == number for each in names)
+            names.append(f"{number}~{count}" if count else number)
+    return names
 
 
 _POSITIONS = {

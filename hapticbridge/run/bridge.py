@@ -30,14 +30,13 @@ from hapticbridge.errors import (
     CommandError,
     DeviceError,
     HapticBridgeError,
-    RecordingError,
     SceneError,
     choices,
 )
 from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, HAND_CODES, OK, RING_FULL
 from hapticbridge.kernel.mujoco_c import quiet, without_timers
 from hapticbridge.realtime import real_time
-from hapticbridge.recording.container import may_be_replaced
+from hapticbridge.recording.container import refuse_replacing
 from hapticbridge.recording.recorder import RecordOutput, RingObserver
 from hapticbridge.run.commands import Command, Repeat, Stop
 from hapticbridge.run.hands import (
@@ -130,10 +129,8 @@ class Bridge:
             raise HapticBridgeError(_no_option(name))
         options = replace(options, **changes)
         path = None if recording is None else Path(recording)
-        if path is not None and not may_be_replaced(path):
-            raise RecordingError(
-                f"'{path}' exists and is no recording, so it is not replaced; choose another file"
-            )
+        if path is not None:
+            refuse_replacing(path)
         self.output = RecordOutput(path, observer, options.live)
         self.clock = clock or RealClock()
         if isinstance(self.clock, type):

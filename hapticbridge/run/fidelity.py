@@ -143,7 +143,7 @@ class Fidelity:
         constraint: Name of the constraint of the file whose force does most of the work between
             both places of its body; empty if none does.
         remedy: Rate, substeps and contact with which no body deviates, tried; None without one.
-        force: Largest force in N with which a still hand holds the tool with the remedy.
+        more: Force in N by which a still hand bears more with the remedy than without; at least 0.
     """
 
     deviations: tuple[Deviation, ...]
@@ -155,7 +155,7 @@ class Fidelity:
     causes: tuple[Cause, ...] = ()
     constraint: str = ""
     remedy: RunPoint | None = None
-    force: float = 0.0
+    more: float = 0.0
 
     @property
     def size(self) -> float:
@@ -203,8 +203,7 @@ class Fidelity:
             return ""
         return (
             f"{_flags(self.remedy, setting)} (tried: each body is then within "
-            f"{format_si(PLACE, 'm')}, and a still hand holds the tool with at most "
-            f"{format_si(self.force, 'N')})"
+            f"{format_si(PLACE, 'm')}, and a still hand bears {format_si(self.more, 'N')} more)"
         )
 
 
@@ -317,21 +316,21 @@ class _FileMotion:
         mujoco.mj_differentiatePos(self.model, way, 1.0, scene.data.qpos, self.last.qpos)
         constraint = _working(self.last, found.deviations[0].number, way)
         causes: list[Cause] = []
-        remedy, bearable, force = None, _force(scene, setting) + MORE, 0.0
+        remedy, more, force = None, 0.0, _force(scene, setting)
         for undone, other in self._settings(scene, setting):
             trial = self._tried(scene, other)
             if trial.size < 0.5 * found.size and not set(causes) & set(undone):
                 causes += undone
             is_calm = trial.created <= max(found.created, NOTABLE_ENERGY)
             if remedy is None and is_calm and not trial.deviations:
-                force = _force(scene, other)
-                remedy = other if force <= bearable else None
+                more = max(_force(scene, other) - force, 0.0)
+                remedy = other if more <= MORE else None
         return replace(
             found,
             causes=tuple(causes) or (self._other_cause(scene, found.deviations[0]),),
             constraint=constraint,
             remedy=remedy,
-            force=force if remedy else 0.0,
+            more=more if remedy else 0.0,
         )
 
     def _other_cause(self, scene: Scene, worst: Deviation) -> Cause:

@@ -124,7 +124,7 @@ TREATMENTS: dict[str, Treatment] = {
     ),
     "memory": Treatment(
         "size", "memory, njmax, nconmax, nstack", "changed",
-        "MuJoCo's default if it is less, 134 MB if it is more or for 1000 rows",
+        "MuJoCo's default if it is less; 134 MB if it is more, or for over 1000 rows",
         "a full memory drops contacts, and an audit has a limit",
     ),
     "margin": Treatment(

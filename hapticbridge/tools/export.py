@@ -126,12 +126,7 @@ class Hdf5Sink:
             self._columns.units.items(), self._columns.kinds, strict=True
         ):
             data = ticks.create_dataset(
-                name.replace("/", "_"),
-                (0,),
-                f"<{kind}8",
-                maxshape=(None,),
-                chunks=(_CHUNK,),
-                compression="gzip",
+                name, (0,), f"<{kind}8", maxshape=(None,), chunks=(_CHUNK,), compression="gzip"
             )
             data.attrs["unit"] = unit
             self._sets.append(data)
