@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from hapticbridge.errors import SceneError as SceneError
     from hapticbridge.kernel.record import SAMPLE_DTYPE as SAMPLE_DTYPE
     from hapticbridge.kernel.record import TickFlag as TickFlag
+    from hapticbridge.program.device_loop import DeviceLoop as DeviceLoop
+    from hapticbridge.program.device_loop import Handle as Handle
+    from hapticbridge.program.device_loop import Surface as Surface
     from hapticbridge.recording import read_recording as read_recording
     from hapticbridge.recording import repair as repair
     from hapticbridge.run.bridge import Bridge as Bridge

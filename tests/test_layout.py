@@ -19,7 +19,7 @@ ORDER = (
     ("arguments", "confinement", "files"),
     ("clock", "coupling", "dataclass_json", "plotting", "sweep"),
     ("kernel",),
-    ("recording", "scene", "theory"),
+    ("program", "recording", "scene", "theory"),
     ("device",),
     ("demand", "testing"),
     ("realtime",),
@@ -203,6 +203,7 @@ SMALL = 80
 
 INTERFACES = {
     "hapticbridge.audit.spring",  # second computation, apart from all that it checks
+    "hapticbridge.program.messages",  # between two processes
     "hapticbridge.lazy",  # imported by package files, which are not counted
     "hapticbridge.device.transport.maker_library",  # libraries of makers, for any driver
     "hapticbridge.run.programs",  # run by scripts/setup and the builder of wheels too

@@ -44,6 +44,12 @@ REASONS = {
     "identify/z_width.py: self.clock.wait()": "a clock's: at most one period",
     "realtime/doctor.py: wait()": "a clock's: at most one period",
     "kernel/machine_code.py: for line in sys.stdin": "the end of the process that asks closes it",
+    "run/endpoint.py: super().wait()": "simulated time waits for nothing",
+    "run/endpoint.py: self._thread.join()": "it looks for the end every REPORT_PERIOD",
+    "run/endpoint.py: time.sleep(LAST_WORDS / 10)": "until LAST_WORDS is over",
+    "program/device_loop.py: process.stdout.readline()": "the process is killed after READY_TIME",
+    "program/device_loop.py: process.communicate()": "it was killed",
+    "program/device_loop.py: time.sleep(REPEAT)": DAEMON,
     # devices and their guardian
     "device/transport/hid.py: self._wake.wait()": f"{DAEMON} longer than MAX_WRITE",
     "device/rawhid/serial.py: self._ports.sleep(PAUSE)": "until the time of its caller is over",

@@ -140,7 +140,12 @@ def _shown_deviations(block: AuditedBlock, balance: EnergyBalance) -> Iterator[D
     is_new = np.diff(steps, prepend=before.row["scene_step"])
     raised = np.where(is_new == 0, tank - last - work, 0.0)
     yield Deviation("scene_tank", raised, allowed, "J", "the shown tool's motion")
-    too_many = np.maximum(np.abs(is_new - 0.5) - 0.5, steps - ticks["tick"] / block.scene_ticks)
+    due = ticks["tick"] / block.scene_ticks
+    if block.is_posted:  # another program shows its tool at any rate
+        due = ticks["tick"] + 1
+        off = np.abs(ticks["potential"] - tank)
+        yield Deviation("potential", off, 0.0, "J", "what another program may still give")
+    too_many = np.maximum(np.abs(is_new - 0.5) - 0.5, steps - due)
     yield Deviation("scene_step", too_many, 0.0, "", "the ticks that it takes")
 
 
@@ -227,6 +232,7 @@ class EnergyBalance:
         discarded: Array = np.zeros(1)
         if parameters.scene_ticks:
             discarded = _summed(_discarded(block, work), before["discarded"])
+        if parameters.scene_ticks and not block.is_posted:
             # lent to the scene: what it took and the hand has not given
             created = created - np.maximum(-(ticks["scene_tank"] + discarded), 0.0)
         linear, angular = _slack_gains(parameters, gains)

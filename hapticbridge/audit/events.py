@@ -6,7 +6,7 @@ kernel; here they become arrays over ticks.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -26,7 +26,7 @@ from hapticbridge.errors import HapticBridgeError, RecordingError, choices
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.recording import RecordingFile
-from hapticbridge.run.commands import bits_in, concerns, coupling_in, tuning_ticks
+from hapticbridge.run.commands import bits_in, concerns, coupling_in, pose_in, tuning_ticks
 from hapticbridge.run.description import STARTS, meta_start, method_of, parameters_of
 
 Array = NDArray[np.float64]
@@ -40,8 +40,6 @@ class RunEvents:
 
     Attributes:
         parameters: Run parameters at the start.
-        tool_home: Pose (7,) of the tool after a reset.
-        handle_home: Pose (7,) of the handle after a reset.
         resumed: Ticks at which the run resumed after a pause without force.
         resets: Ticks before which the scene was reset.
         couplings: Couplings of the law (K and B') in order, the initial one first.
@@ -50,8 +48,6 @@ class RunEvents:
     """
 
     parameters: RunParameters
-    tool_home: Array
-    handle_home: Array
     resumed: Array
     resets: Array
     couplings: tuple[Coupling, ...]
@@ -59,6 +55,7 @@ class RunEvents:
     unanswered: str
     _began: Array
     _switched: tuple[Array, NDArray[np.int64]]
+    _homes: tuple[Array, Array]
 
     @classmethod
     def from_recording(cls, recording: RecordingFile, parameters: RunParameters) -> RunEvents:
@@ -79,8 +76,6 @@ class RunEvents:
         }
         return cls(
             parameters=parameters,
-            tool_home=np.array(meta_start(recording.meta, "tool_start")),
-            handle_home=np.array(meta_start(recording.meta, "handle_start")),
             resumed=ticks["resume"],
             resets=ticks["reset"],
             couplings=(
@@ -94,6 +89,7 @@ class RunEvents:
                 ticks["switch"],
                 np.array([bits_in(e) for e in by_name["switch"]], np.int64),
             ),
+            _homes=_homes(recording.meta, by_name["reset"]),
         )
 
     def gains(self, numbers: NDArray[np.int64]) -> Array:
@@ -120,6 +116,12 @@ class RunEvents:
     def is_reset(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Returns True for each tick that began with a reset."""
         return np.isin(numbers, self.resets)
+
+    def homes(self, numbers: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Returns the poses of handle and tool after the newest reset until each tick, (n, 7)."""
+        newest = np.searchsorted(self.resets, numbers, side="right") - 1
+        handles, tools = self._homes
+        return handles[np.maximum(newest, 0)], tools[np.maximum(newest, 0)]
 
     def changes_of_coupling(self, method: Method) -> tuple[str, ...]:
         """Returns sentences about changes of the coupling; empty without any."""
@@ -210,6 +212,16 @@ def _tick(event: Mapping[str, Any]) -> int:
             f"event '{event.get('event')}' has tick {tick!r}; it must be a whole number >= 0"
         )
     return tick
+
+
+def _homes(meta: Mapping[str, str], resets: Sequence[Mapping[str, Any]]) -> tuple[Array, Array]:
+    """Returns the poses of handle and tool after each reset, (m, 7); at the start without one."""
+    starts = [tuple(meta_start(meta, f"{body}_start")) for body in ("handle", "tool")]
+    placed = [pose_in(event) for event in resets]
+    handles, tools = (
+        np.array([pose or start for pose in placed] or [start], float) for start in starts
+    )
+    return handles, tools
 
 
 def _added_delay(event: Mapping[str, Any]) -> float:
@@ -310,6 +322,7 @@ class AuditState:
             "handle": starts["handle_start"],
             "tool": starts["tool_start"],
         }
+        row["scene_tank"] = parameters.credit
         for body, pose in poses.items():
             row[f"{body}_position"], row[f"{body}_quaternion"] = pose[:3], pose[3:]
         return cls(

@@ -95,8 +95,9 @@ class Motion:
         rows = np.concatenate([state.row, ticks])
         is_reset = events.is_reset(ticks["tick"])[:, None]
         handle, tool = pose_of(rows, "handle"), pose_of(rows, "tool")
-        handle_before = np.where(is_reset, events.handle_home, handle[:-1])
-        tool_before = np.where(is_reset, events.tool_home, tool[:-1])
+        handle_home, tool_home = events.homes(ticks["tick"])
+        handle_before = np.where(is_reset, handle_home, handle[:-1])
+        tool_before = np.where(is_reset, tool_home, tool[:-1])
         handle, tool = handle[1:], tool[1:]
         parameters, device = events.parameters, pose_of(rows, "device")
         axes = np.array(parameters.axes).reshape(3, 3)

@@ -43,6 +43,7 @@ from hapticbridge.run.description import (
     parameters_of,
     requested_of,
 )
+from hapticbridge.run.posted_scene import PostedScene
 from hapticbridge.run.request import request_of
 from hapticbridge.run.slow_scene import SlowScene
 from hapticbridge.run.unpacked import load_unpacked, unpack_scene
@@ -88,17 +89,19 @@ def report_errors(report: Callable[[str], None]) -> None:
     pointer.value = ctypes.cast(_HANDLERS[-1], ctypes.c_void_p).value
 
 
-def machine_code_for(recording: RecordingFile, parameters: RunParameters) -> tuple[str, str, bool]:
+def machine_code_for(recording: RecordingFile, parameters: RunParameters) -> tuple[str, str, str]:
     """Returns the arguments of ``load_machine_code`` for a run."""
-    method, is_slow = method_of(recording.meta), parameters.scene_ticks > 0
-    return method.name, method.contact, is_slow
+    method = method_of(recording.meta)
+    kind = "posted" if parameters.credit > 0.0 else "slow" if parameters.scene_ticks else ""
+    return method.name, method.contact, kind
 
 
 @cache
-def load_machine_code(name: str, contact: str, is_slow: bool) -> None:
+def load_machine_code(name: str, contact: str, kind: str = "") -> None:
     """Loads the machine code of a method, which is first compiled and kept on disk if missing.
 
-    A child process may not write it, and each would load it again.
+    A child process may not write it, and each would load it again. ``kind`` is "slow" for a scene
+    slower than the loop, "posted" for that of another program.
     """
     method = method_named(name).with_contact(contact)
     coupling, period = Coupling(1000.0, 1.0, 1.0, 1e-3), 1e-3
@@ -109,14 +112,18 @@ def load_machine_code(name: str, contact: str, is_slow: bool) -> None:
         parameters = unguarded_parameters(scene, coupling, period, 1, method)
         if method.has_law:
             static_load(scene, parameters)
-        parameters = replace(parameters, scene_ticks=2 * is_slow)
+        parameters = replace(
+            parameters, scene_ticks=2 * bool(kind), credit=1.0 * (kind == "posted")
+        )
         kernel = BoundKernel(scene.model, scene.data, parameters)
         sample, nothing = np.zeros(1, SAMPLE_DTYPE), np.zeros(1)
         rows, flags = np.zeros(1, TICK_DTYPE), np.zeros(1, np.int64)
         sample["quaternion"][:, 0] = 1.0
         jit.direct(stretch_at, kernel.state[0], sample)  # of a run with absolute poses
-        if is_slow:
-            slow = SlowScene(kernel, scene.model, scene.data, parameters)
+        if kind:
+            slow: SlowScene | PostedScene = PostedScene(kernel, parameters)
+            if kind == "slow":
+                slow = SlowScene(kernel, scene.model, scene.data, parameters)
             slow.simulate(sample, flags, nothing, flags, rows)
             slow.close()
         else:

@@ -41,6 +41,7 @@ from hapticbridge.run.description import (
     start_of,
     versions,
 )
+from hapticbridge.run.posted_scene import PostedScene, posts_in
 from hapticbridge.run.slow_scene import SlowScene
 from hapticbridge.scene import Scene
 from hapticbridge.scene.compile import clause
@@ -163,8 +164,10 @@ class Resimulator:
             raise RecordingError(f"MuJoCo stopped in its first step: {clause(error)}") from None
         self.hands = BoundHands(model, data, every) if others else None
         self.binding = self.hands.hands[0] if self.hands else BoundKernel(model, data, parameters)
-        self._slow: SlowScene | None = None
-        if parameters.scene_ticks:
+        self._slow: SlowScene | PostedScene | None = None
+        if parameters.credit > 0.0:
+            self._slow = PostedScene(self.binding, parameters, posts_in(events))
+        elif parameters.scene_ticks:
             self._slow = SlowScene(self.binding, model, data, parameters)
         hands = tuple(zip((self.hands or self.binding).hands, every, strict=True))
         self._commands = EventApplier(hands, data, method, start, self._slow)

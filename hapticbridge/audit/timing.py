@@ -148,7 +148,8 @@ class TimingTally:
         """
         parameters, guarding = self.parameters, self.parameters.guarding
         time = 1e-9 * np.diff(times)[:, None]
-        is_late, time = time > _LATE * parameters.period, np.where(time > 0, time, np.inf)
+        is_late = (time > _LATE * parameters.period) | (parameters.credit > 0.0)
+        time = np.where(time > 0, time, np.inf)
         points = np.unique(np.concatenate([self.arrivals, times]))
         points = points[(points >= times[0]) & (points <= times[-1])]
         held = np.maximum(np.searchsorted(self.arrivals, points[:-1], "right") - 1, 0)

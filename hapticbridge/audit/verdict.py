@@ -48,7 +48,7 @@ from hapticbridge.kernel.record import CLOCK_FIELDS
 from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
 from hapticbridge.run.description import meta_start, requested_of
-from hapticbridge.run.summary import Environment, was_never_lossless
+from hapticbridge.run.summary import Environment, posted_words, was_never_lossless
 from hapticbridge.units import format_energy
 
 Verdict = Literal["passive", "unverified", "active", "invalid"]
@@ -93,6 +93,7 @@ class AuditReport:
             needed than available; None if b is unknown or the motion prescribed.
         energies: Energies at the end, in J.
         start_potential: Potential energy before the first tick in J; its zero is arbitrary.
+        credit: Energy in J that another program's scene may give to the hand; 0 for another scene.
         hand_energies: Energy that each hand got and what paid for it; empty if invalid.
         events: Number of events of each kind.
         findings: Faults of the scene of which the run warned, as sentences.
@@ -128,6 +129,7 @@ class AuditReport:
     damping_margin: float | None = None
     energies: dict[str, float] = field(default_factory=dict)
     start_potential: float = 0.0
+    credit: float = 0.0
     hand_energies: tuple[HandEnergy, ...] = ()
     events: dict[str, int] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
@@ -224,7 +226,7 @@ def verdict_words(verdict: str, environment: str, port: str) -> str:
 MAX_WORDS = 500
 """Largest number of characters of a text that is read from a foreign file."""
 
-_USUAL_ENDS = ("duration", "signal", "caller", BY_TRIP, None, "")
+_USUAL_ENDS = ("duration", "signal", "caller", "program", BY_TRIP, None, "")
 
 
 def unusual_end(trip: Trip | None, events: Sequence[Mapping[str, Any]]) -> str:
@@ -392,7 +394,9 @@ def decide(
             port="environment",
             joules=joules,
         )
-    if unstrict is None:
+    if unstrict is None and report.credit:
+        sentence = posted_words(report.credit)
+    elif unstrict is None:
         # rounding may leave it above zero
         lost = max(-energies.energies["environment_energy"], 0.0)
         spent = f"{format_energy(lost)} dissipated" if lost else "nothing was dissipated"
@@ -449,7 +453,9 @@ def verdict_on(
         hands = [AuditedHand(each, AuditedRun.of(each)) for each in recordings]
         devices = [JudgedDevice.before_run(hand) for hand in hands]
         report = replace(report, **_joined(devices))
-        report = replace(report, duration=recording.count * hands[0].run.parameters.period)
+        parameters = hands[0].run.parameters
+        report = replace(report, duration=recording.count * parameters.period)
+        report = replace(report, credit=parameters.credit)
         report = replace(report, unchecked=_unchecked(hands[0].run))
         fault = file_fault(recording) or first_contradiction(metadata_statements(recordings))
         fault = fault or _hands_fault(hands)
@@ -481,7 +487,7 @@ def _hand_words(report: AuditReport) -> str:
         at = f" at {grip!r}" if grip else ""
         if energy.net > INSTANT:
             parts.append(f"net to the hand{at} {energy.sentence}")
-        elif energy.release:
+        elif energy.release and not report.credit:
             parts.append(f"the scene's storage{at} {energy.release}")
         if energy.blur:
             parts.append(f"encoder steps{at} {energy.blur}")

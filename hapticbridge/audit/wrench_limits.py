@@ -52,6 +52,7 @@ class AuditedBlock:
         lever_before: r_{k−1}, the part of the device's motion that the handle made, (n,).
         rise_ticks: Ticks in which r rises from 0 to 1, (n,).
         scene_ticks: Ticks between two results of a slower scene; 0 for another.
+        is_posted: True if another program steps the scene.
     """
 
     ticks: NDArray[np.void]
@@ -63,6 +64,7 @@ class AuditedBlock:
     lever_before: Array
     rise_ticks: Array
     scene_ticks: int
+    is_posted: bool
 
     @classmethod
     def from_records(
@@ -93,6 +95,7 @@ class AuditedBlock:
             lever_before=before,
             rise_ticks=rise,
             scene_ticks=parameters.scene_ticks,
+            is_posted=parameters.credit > 0.0,
         )
 
     def state_after(self, sums: dict[str, float]) -> AuditState:

@@ -30,6 +30,7 @@ DONE, READER_GONE, USAGE_ERROR, SAFETY_TRIP = 0, 1, 2, 3
 COMMANDS = {
     "guide": "Read how to do something, and why it works.",
     "run": "Put a scene behind a haptic device and feel it.",
+    "serve": "Run a device's loop for another program, which steps the scene.",
     "scenes": "List the scenes, or the parameters of one.",
     "new-scene": "Write a commented scene to start from.",
     "check": "Find what is wrong with a scene, and what a tick of it costs.",
@@ -50,7 +51,7 @@ COMMANDS = {
 """Summary of each command, in the order of the top-level help: the first line of the command's
 class, without importing it. The class has the command's name, each word with a capital."""
 
-_HEADINGS = {"run": "Scenes", "audit": "Recordings", "devices": "Devices", "bound": "Theory"}
+_HEADINGS = {"run": "Scenes", "audit": "Recordings", "devices": "Devices and theory"}
 """Headings of the top-level help, by the command below."""
 
 _MODULES = {

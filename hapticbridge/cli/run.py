@@ -274,6 +274,28 @@ def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]
         )
 
 
+def refuse_overwriting(record: Path | None, *devices: str, overwrite: bool) -> None:
+    """Refuses a file that was not to be replaced, no recording, or the motion of the run.
+
+    ``devices`` are the run's, as named.
+    """
+    if record is None:
+        if overwrite:
+            raise HapticBridgeError(
+                "--overwrite goes with --record FILE; nothing would be recorded"
+            )
+        return
+    if not record.exists():
+        return
+    if not overwrite:
+        raise RecordingError(f"'{record}' exists; choose another file or add --overwrite")
+    refuse_replacing(record)
+    for named in devices:
+        motion = Path(named.partition("trajectory:")[2].partition(":/")[0])
+        if motion.is_file() and motion.samefile(record):
+            raise RecordingError(f"'{motion}' is the motion of the run; choose another file")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
     """Put a scene behind a haptic device and feel it.
@@ -338,24 +360,9 @@ class Run:
     as_json: bool = option(False, flag="json")
     """Print the summary as JSON."""
 
-    def _check_overwriting(self, record: Path) -> None:
-        """Refuses a file that was not to be replaced, no recording, or the motion of the run."""
-        if not self.overwrite:
-            raise RecordingError(f"'{record}' exists; choose another file or add --overwrite")
-        refuse_replacing(record)
-        for named in (self.device, *self.hand):
-            motion = Path(named.partition("trajectory:")[2].partition(":/")[0])
-            if motion.is_file() and motion.samefile(record):
-                raise RecordingError(f"'{motion}' is the motion of the run; choose another file")
-
     def execute(self) -> int:
         """Runs the bridge; returns the exit code."""
-        if self.overwrite and self.record is None:
-            raise HapticBridgeError(
-                "--overwrite goes with --record FILE; nothing would be recorded"
-            )
-        if self.record is not None and self.record.exists():
-            self._check_overwriting(self.record)
+        refuse_overwriting(self.record, self.device, *self.hand, overwrite=self.overwrite)
         clock = SimulatedClock() if self.fast else RealClock()
         if self.hand and (self.grip != "grip" or self.device != "simulated"):
             raise HapticBridgeError("--hand GRIP=DEVICE takes the place of --grip and --device")

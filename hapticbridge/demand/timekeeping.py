@@ -185,6 +185,8 @@ class Timekeeping:
         alarm: Finding of the watch for a late or reversed force; None without one.
         scene_rate: Results per second in Hz that a slower scene was to give; None for another.
         scene_speed: Share of them that it gave, 0 to 1.
+        shown_rate: Poses per second in Hz that another program showed of its tool; None for another
+            scene.
         scene_silence: Longest time in s without a new one.
         silence: Longest silence of the device for which the force faded; None without one.
         sample_rate: New samples per second of a device that gave fewer than were due; 0 for
@@ -207,6 +209,7 @@ class Timekeeping:
     alarm: Alarm | None
     scene_rate: float | None
     scene_speed: float
+    shown_rate: float | None
     scene_silence: float
     silence: Silence | None
     sample_rate: float
@@ -223,6 +226,7 @@ class Timekeeping:
     ) -> Timekeeping:
         """Judges the times of a run by its device conditions; none for a run without a law."""
         rate, stated = 1.0 / parameters.period, stated_rate or math.inf
+        is_slow = parameters.scene_ticks > 0 and parameters.credit == 0.0
         share = times.ticks / times.due if times.due > times.ticks else 1.0
         least = min(share, times.fresh)
         silence = silence_in(times, parameters)
@@ -248,8 +252,11 @@ class Timekeeping:
             is_kept=all(verdicts) and (is_paid or not is_known) if is_borne else None,
             is_realtime=times.is_realtime,
             alarm=Alarm.of(times.flags),
-            scene_rate=1.0 / parameters.scene_period if parameters.scene_ticks else None,
-            scene_speed=_scene_speed(times, parameters.scene_ticks),
+            scene_rate=1.0 / parameters.scene_period if is_slow else None,
+            scene_speed=_scene_speed(times, parameters.scene_ticks) if is_slow else 1.0,
+            shown_rate=times.scene_steps / (max(times.due, 1) * parameters.period)
+            if parameters.credit > 0.0
+            else None,
             scene_silence=times.scene_silence,
             silence=silence,
             sample_rate=sample_rate,
@@ -267,6 +274,10 @@ class Timekeeping:
             late += f", the scene at {self.scene_rate:.4g} Hz and {speed}"
             if self.scene_silence * self.scene_rate > SILENT_PERIODS:
                 late += f", once without a result for {format_si(self.scene_silence, 's')}"
+        if self.shown_rate is not None:
+            late += f", {self.shown_rate:.4g} poses per second from the program"
+            if self.scene_silence > 2.0 / max(self.shown_rate, 1e-9):
+                late += f", once none for {format_si(self.scene_silence, 's')}"
         of_what = "new samples at " if lost else ""
         return f"{of_what}{self.rate:.4g} Hz, {self._percent} of the deadlines kept{lost}{late}"
 
@@ -285,7 +296,11 @@ class Timekeeping:
     @property
     def remark(self) -> str:
         """``words`` where the run was not simply in time; else empty."""
-        is_exact = min(self.share, self.fresh) == 1.0 and not self._late and not self.scene_rate
+        is_exact = (
+            min(self.share, self.fresh) == 1.0
+            and not self._late
+            and not (self.scene_rate or self.shown_rate)
+        )
         return "" if is_exact else self.words
 
     @property

@@ -195,9 +195,17 @@ def anchor_handle(pose: Part) -> None:
         pose.handle_origin[3 + i] = pose.handle_quaternion[i]
 
 
-def move_handle_home(pose: Part) -> None:
-    """Puts the handle at rest to its pose before the first tick, where it carries the tool."""
+def move_handle_home(pose: Part, *, at_tool: bool = False) -> None:
+    """Puts the handle at rest to its pose before the first tick, where it carries the tool.
+
+    With ``at_tool`` its home is the tool's present pose from now on.
+    """
     pose["handle_step"] = pose["handle_turn"] = 0.0
+    if at_tool:
+        pose["handle_home"][:3], pose["handle_home"][3:] = (
+            pose["tool_position"],
+            pose["tool_quaternion"],
+        )
     pose["handle_position"] = pose["handle_home"][:3]
     pose["handle_quaternion"] = pose["handle_home"][3:]
 

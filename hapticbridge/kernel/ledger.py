@@ -525,9 +525,13 @@ def refresh_energies(s: State) -> None:
     """Computes kinetic and potential energy for the state after the step.
 
     Kinetic energy needs the inertia matrix, potential energy the positions and the tendon lengths.
-    MuJoCo's position stage has computed them if it ran since the step.
+    MuJoCo's position stage has computed them if it ran since the step. All that another program's
+    scene may still give is the tank of its shown tool.
     """
     mj = s.mj
+    if s.shown.is_posted:
+        s.energy.potential = s.shown.tank
+        return
     if not s.loop.has_positions:
         refresh_inertia(s)
     s.energy.potential = potential_energy(s)
@@ -656,7 +660,8 @@ def judge_balance(s: State) -> bool:
     energy = s.energy
     stored = (energy.kinetic + energy.potential) - energy.start_energy
     created = created_energy(energy)
-    if s.run.scheme == Scheme.SHOWN:  # work that the hand still owes is not created
+    # work that the hand still owes is not created; another program's is in its tank
+    if s.run.scheme == Scheme.SHOWN and not s.shown.is_posted:
         created -= max(s.shown.scene_work - energy.coupling_work, 0.0)
     energy.environment_energy = created
     energy.is_constrained = 0

@@ -275,6 +275,8 @@ class RunParameters(StepTimes):
             scene.
         scene_ticks: Ticks per ``substeps`` of a scene that is slower than the loop
             (``kernel.shown_tool``); 0 for a scene that steps in every tick.
+        credit: Energy in J that a scene of another program may give to the hand beyond what the
+            hand put in; 0 for a scene of the bridge.
         is_beside: True for a slower scene's own loop (``of_scene``).
 
     Raises:
@@ -302,6 +304,7 @@ class RunParameters(StepTimes):
     guarding: GuardParameters = UNGUARDED
     is_rigid: bool = False
     scene_ticks: int = 0
+    credit: float = option(0.0, unit="J", least=0.0)
     is_beside: bool = False
 
     def __post_init__(self) -> None:
@@ -317,6 +320,10 @@ class RunParameters(StepTimes):
             )
         refuse_substeps(self.scheme, self.substeps)
         refuse_scene_ticks(self.scheme, self.scene_ticks)
+        if self.credit > 0.0 and not self.scene_ticks:
+            raise HapticBridgeError(
+                f"credit is {self.credit!r} J for a scene that steps in every tick; it must be 0"
+            )
         for name in ("device_origin", "handle_origin", "device_start"):
             pose = getattr(self, name)
             if len(pose) != 7 or not all(math.isfinite(value) for value in pose):
@@ -363,6 +370,7 @@ class RunParameters(StepTimes):
             self,
             period=self.scene_period,
             scene_ticks=0,
+            credit=0.0,
             is_beside=True,
             scale=1.0,
             force_scale=1.0,

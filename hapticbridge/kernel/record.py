@@ -100,7 +100,28 @@ the wrench that was sent, and of the device's motion to the next sample that the
 than the loop, and ``scene_tank`` is the energy in J that the hand has given and that scene has not
 yet got; both are 0 for a scene that steps in every tick (``kernel.shown_tool``)."""
 
-FORMAT = "4"
+PLANES = 16
+"""Largest number of surfaces near a tool that stop it between two of its poses."""
+
+POST_DTYPE = np.dtype(
+    [
+        ("has_velocity", "<i8"),
+        ("planes", "<i8"),
+        ("work", "<f8"),
+        ("pose", "<f8", 7),
+        ("velocity", "<f8", 6),
+        ("normals", "<f8", 3 * PLANES),
+        ("arms", "<f8", 3 * PLANES),
+        ("gaps", "<f8", PLANES),
+    ]
+)
+"""Tool as another program shows it: the pose of the grip in m and as a quaternion
+(w, x, y, z), its velocity in m/s and rad/s where ``has_velocity`` is 1, and surfaces near it: for
+each a normal away from the surface, the arm from the grip to the point of the tool next to it in m
+and the gap there in m. ``work`` in J is all that the coupling has done on the program's tool so
+far, 0 where the program applies no wrench."""
+
+FORMAT = "5"
 """Format of a recording: its fields, the request with its options, and the numbers that follow from
 it. A recording of another format is refused, so other fields in any of them need the next number.
 

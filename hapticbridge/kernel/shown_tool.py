@@ -35,6 +35,15 @@ tool is shown only where that costs nothing, P >= 0. So Σ P >= min W over the t
 the hand cannot get more than the scene has released. The next handle that the scene is given is
 drawn so near to its tool that the springs hold no more than the credit + D. The credit is what they
 hold at the force level, F²/2K + F_r²/2K_r, at the present gains.
+
+Another program may step the scene and post the tool's pose when it has one, at any rate. Without a
+velocity the tool is led to the posted pose within the time between the last two posts. Nothing is
+known of the program's energy but the work W that it states, and W < 0 counts as 0: the tank begins
+with a stated credit E_0, and the hand gets at most E_0 beyond what it put in, whatever is posted:
+
+    D = E_0 + Σ P − max(W, 0) >= 0
+
+The scene's stored energy is then D itself, because that is all that it may still give.
 """
 
 from __future__ import annotations
@@ -79,14 +88,15 @@ from hapticbridge.kernel.pose import (
     subtract,
     vector_of,
 )
+from hapticbridge.kernel.record import PLANES
 from hapticbridge.kernel.rigid_contact import opening
-
-PLANES = 16
-"""Largest number of surfaces that stop the shown tool between two steps of the scene."""
 
 LONGEST = 3.0
 """Time beyond the handle of the newest result, in scene periods, for which the tool's motion is
 foreseen. If the next result is later than that, the tool stays where it is shown."""
+
+SLOWEST = 0.25
+"""Longest time in s in which a posted pose is approached."""
 
 TRIALS, NEAR = 8, 1.0 - 1e-6
 """Largest number of motions that are tried for the largest one that the tank pays for, and share of
@@ -99,6 +109,7 @@ SHOWN_DTYPE = np.dtype(
     [
         ("is_shown", "<i8"),
         ("is_beside", "<i8"),
+        ("is_posted", "<i8"),
         ("failure", "<i8"),
         ("waits", "<i8"),
         ("scene_step", "<i8"),
@@ -111,6 +122,7 @@ SHOWN_DTYPE = np.dtype(
         ("scene_period", "<f8"),
         ("timestep", "<f8"),
         ("lead", "<f8"),
+        ("horizon", "<f8"),
         ("tank", "<f8"),
         ("passing", "<f8"),
         ("work", "<f8"),
@@ -126,11 +138,13 @@ SHOWN_DTYPE = np.dtype(
     ]
 )
 """Sub-record ``shown``, written by this module alone. ``is_beside`` is 1 in the
-scene's own loop, which writes ``before`` alone. ``failure`` is the result of a step of the scene
-that is not usable, else ``OK``. ``waits`` is 1 while the scene has a handle,
+scene's own loop, which writes ``before`` alone, ``is_posted`` if another program posts the poses.
+``failure`` is the result of a step of the scene that is not usable, else ``OK``. ``waits`` is 1
+while the scene has a handle,
 ``scene_step`` counts the scene's steps shown so far, ``age`` the ticks since the last handle was
 handed over, ``held_back`` those in which the tank was too low for y*, ``silence`` those since the
-newest result. ``lead`` in s is the age of the newest result when it was taken over. ``tank`` D,
+newest result. ``lead`` in s is the age of the newest result when it was taken over, ``horizon`` the
+time in s for which its motion is foreseen. ``tank`` D,
 ``passing``, ``work`` P of the present tick and ``scene_work`` W in J. ``before`` and ``newest`` are
 the tool's poses before and after MuJoCo's newest step; a plane has a normal away from the surface,
 the arm from the grip to the contact point, the gap at the pose ``before`` in m, and the speed
@@ -151,6 +165,9 @@ def bind_shown(shown: Part, parameters: RunParameters) -> None:
     shown["is_shown"], shown["scene_period"] = 1, of_scene.period
     shown["timestep"] = of_scene.period / of_scene.substeps
     shown["passing"] = 2.0 * power * of_scene.period
+    shown["horizon"] = LONGEST * of_scene.period
+    if parameters.credit > 0.0:
+        shown["is_posted"], shown["tank"] = 1, parameters.credit
 
 
 def tool_geoms(model: mujoco.MjModel, grip_site: int) -> NDArray[np.int32]:
@@ -249,6 +266,42 @@ def take_over(state: NDArray[np.void], scene_state: NDArray[np.void]) -> None:
 
 
 @compiled
+def take_posted(state: NDArray[np.void], posts: NDArray[np.void]) -> None:
+    """Takes over a pose of the tool that another program has posted (``record.POST_DTYPE``)."""
+    s, post = state[0], posts[0]
+    shown, pose = s.shown, s.pose
+    since = min(max(shown.silence, 1) * s.run.period, SLOWEST)
+    work = max(post.work, 0.0)
+    shown.tank -= work - shown.scene_work
+    shown.scene_work = work
+    position, orientation = vector_of(post.pose), canonical(quaternion_of(post.pose[3:7]))
+    store_vector(shown.before[0:3], position)
+    store_quaternion(shown.before[3:7], orientation)
+    from_position, from_orientation = position, orientation
+    shown.horizon = LONGEST * since
+    for i in range(6):
+        shown.acceleration[i] = 0.0
+        shown.velocity[i] = post.velocity[i]
+    if not post.has_velocity:
+        shown.horizon = since
+        from_position = vector_of(pose.tool_position)
+        from_orientation = quaternion_of(pose.tool_quaternion)
+        step = scaled(1.0 / since, subtract(position, from_position))
+        turn = scaled(1.0 / since, rotation_between(from_orientation, orientation))
+        store_vector(shown.velocity[0:3], step)
+        store_vector(shown.velocity[3:6], turn)
+    store_vector(shown.newest[0:3], from_position)
+    store_quaternion(shown.newest[3:7], from_orientation)
+    shown.planes = post.planes
+    for i in range(post.planes):
+        shown.gaps[i], shown.speeds[i] = post.gaps[i], 0.0
+    for i in range(3 * post.planes):
+        shown.normals[i], shown.arms[i] = post.normals[i], post.arms[i]
+    shown.scene_step += 1
+    shown.silence = shown.age = 0
+
+
+@compiled
 def note_contacts(s: State) -> None:
     """Notes the tool's pose at the start of MuJoCo's newest step, at which contacts were found.
 
@@ -302,7 +355,7 @@ def _take_planes(s: State, scene: State) -> None:
 def _foreseen(s: State) -> tuple[Vector, Quaternion]:
     """Returns y*, where the tool is by now as far as is known."""
     shown = s.shown
-    q = min(shown.age * s.run.period + shown.lead, LONGEST * shown.scene_period)
+    q = min(shown.age * s.run.period + shown.lead, shown.horizon)
     v, a, half = shown.velocity, shown.acceleration, 0.5 * q * q
     step = add(scaled(q, vector_of(v)), scaled(half, vector_of(a)))
     turn = add(scaled(q, vector_of(v[3:6])), scaled(half, vector_of(a[3:6])))

@@ -301,8 +301,11 @@ class BoundKernel:
             self._restore_springs(self._record)
         restore_model(self._model, self._owned)
 
-    def handle_reset(self) -> None:
+    def handle_reset(self, pose: Sequence[float] | None = None) -> None:
         """Continues after the scene's data were set back to a start.
+
+        ``pose`` is where another program has put its tool, as x, y, z, qw, qx, qy, qz; the handle
+        is put there, too.
 
         The handle is placed at its start, and the device's pose belongs to it from the next tick
         on; a slower scene's handle stays that of its loop. The change of the scene's storage is
@@ -311,7 +314,9 @@ class BoundKernel:
         s = self._record
         before = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         self._take_tool_pose()
-        move_handle_home(s["pose"])
+        if pose is not None:
+            set_tool(s["pose"], np.array(pose[:3]), np.array(pose[3:]))
+        move_handle_home(s["pose"], at_tool=pose is not None)
         restore_model(self._model, self._owned)
         discard_wrench(s["loop"])
         direct(refresh_energies, s)(s)
@@ -412,6 +417,9 @@ class BoundKernel:
         s = self._record
         self._take_tool_pose()
         bind_poses(s["run"], s["pose"], parameters)
+        if parameters.credit > 0.0:  # until the program shows its tool, that is at the handle
+            pose = s["pose"]
+            set_tool(pose, pose["handle_position"], pose["handle_quaternion"])
         if self._loop is not None:
             follow_handle(s["pose"], self._loop.state["pose"][0])
         if parameters.scheme == Scheme.MASSLESS:

@@ -140,7 +140,13 @@ from hapticbridge.kernel.pose import (
     vector_of,
 )
 from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, finish_contacts, follow_speed
-from hapticbridge.kernel.shown_tool import hand_over, note_contacts, shown_wrench, take_over
+from hapticbridge.kernel.shown_tool import (
+    hand_over,
+    note_contacts,
+    shown_wrench,
+    take_over,
+    take_posted,
+)
 from hapticbridge.kernel.springs import restore_springs
 from hapticbridge.kernel.swing_watch import watch_device
 from hapticbridge.kernel.tick_guard import (
@@ -601,7 +607,7 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
     loop = s.loop
     loop.has_positions = has_positions
     restore_springs(s)
-    if s.run.scheme not in (Scheme.MASSLESS, Scheme.SHOWN):
+    if s.run.scheme not in (Scheme.MASSLESS, Scheme.SHOWN) or s.shown.is_posted:
         refresh_energies(s)
     if s.run.scheme == Scheme.MIDPOINT and finish_lossless(s):
         loop.has_positions = 0  # it was computed with the springs of the other form
@@ -987,6 +993,46 @@ def simulate_shown(
         s.loop.external_flags = external_flags[k]
         is_due = scene_steps[k] > s.shown.scene_step
         if not shown_tick(states, own, samples[k : k + 1], elapsed[k], is_due):
+            return k
+        rows[k] = row[0]
+    return int(samples.size)
+
+
+@compiled_for_threads
+def simulate_posted(
+    state: NDArray[np.void],
+    samples: NDArray[np.void],
+    recorded: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]],
+    posts: NDArray[np.void],
+    row: NDArray[np.void],
+    rows: NDArray[np.void],
+) -> int:
+    """Runs the ticks of a recorded run in front of another program's scene.
+
+    Args:
+        state: The bound state.
+        samples: Device samples, one per tick.
+        recorded: As for ``simulate_shown``.
+        posts: All that the program posted, in order; the n-th is taken over where ``scene_step``
+            rises to n.
+        row: The bound record.
+        rows: Receives the records; as long as ``samples``.
+
+    Returns:
+        Count of completed ticks, as for ``simulate``.
+    """
+    s = state[0]
+    external_flags, elapsed, scene_steps = recorded
+    for k in range(samples.size):
+        s.loop.external_flags = external_flags[k]
+        if before_step(state, samples[k : k + 1], row, 0, elapsed[k]) != OK:
+            return k
+        place = s.shown.scene_step
+        if scene_steps[k] > place:
+            if place >= posts.size:
+                return k
+            take_posted(state, posts[place : place + 1])
+        if after_step(state, row, 0) != OK:
             return k
         rows[k] = row[0]
     return int(samples.size)

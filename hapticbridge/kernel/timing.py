@@ -21,8 +21,9 @@ and for the motion δp_k within the time τ, however it was spread, with the mea
 which is never more. r is the lever: the handle moved by r_{k−1} times the device's motion. The
 first is taken, so that A holds what another hand could have had at the same forces. For a sample
 that comes late, or in some ticks only, it is the second: then the handle slips for the motion that
-there was (``law.charge_lateness``). In ticks without a new sample the device may have held the
-force of the last one, so that no other enters w.
+there was (``law.charge_lateness``). So it is before another program's scene, whose tool may jump:
+the wrench after the jump is no force that the hand has felt. In ticks without a new sample the
+device may have held the force of the last one, so that no other enters w.
 
 C is 0 for a device in time. Behind a delay it is the energy credit of the passivity controller:
 what wrenches on their way will cost, motion has paid for before.
@@ -183,7 +184,8 @@ def keep_account(s: State, deadline_ns: int, read_ns: int, write_ns: int) -> Non
     if t.is_new or not t.is_timed:
         stored, time = _stored(s), 1e-9 * (read_ns - t.since)
         if t.is_timed and time > 0.0:
-            energy = _energy(s, time, time > LATE * s.run.period)
+            is_late = time > LATE * s.run.period or s.shown.is_posted > 0
+            energy = _energy(s, time, is_late)
             t.uncovered = max(t.uncovered + energy + stored - t.stored, -credit)
         t.stored, t.since, t.now = stored, read_ns, read_ns
         t.newest += 1

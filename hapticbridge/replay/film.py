@@ -321,7 +321,7 @@ class _Child:
 # Work of the child
 
 
-def _load(draws: bool, code: tuple[str, str, bool]) -> None:
+def _load(draws: bool, code: tuple[str, str, str]) -> None:
     """Loads the renderer, if the work draws, and machine code."""
     if draws:
         from mujoco.rendering.classic.gl_context import GLContext  # noqa: PLC0415 - if it draws

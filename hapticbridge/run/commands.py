@@ -20,7 +20,15 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.arguments import LARGEST, SMALLEST, check_fields, rule_of, shared, shown
+from hapticbridge.arguments import (
+    LARGEST,
+    SMALLEST,
+    check_fields,
+    is_number,
+    rule_of,
+    shared,
+    shown,
+)
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import StepCondition, assumed_damping
 from hapticbridge.demand.guard import Limits
@@ -39,6 +47,7 @@ from hapticbridge.kernel.ledger import take_scene_works
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.run.description import restore_state
+from hapticbridge.run.posted_scene import PostedScene
 from hapticbridge.run.slow_scene import SlowScene
 from hapticbridge.scene.inputs import applied_writes
 from hapticbridge.units import format_si
@@ -511,6 +520,24 @@ def bits_in(event: Mapping[str, Any]) -> int:
     return (0 if force else FORCE_OFF) | (CLUTCHED if clutch else 0)
 
 
+def pose_in(event: Mapping[str, Any]) -> tuple[float, ...] | None:
+    """Returns where an event ``reset`` puts another program's tool; None for a reset of a scene.
+
+    Raises:
+        RecordingError: The pose is damaged.
+    """
+    pose = event.get("pose")
+    if pose is None:
+        return None
+    numbers = tuple(pose) if isinstance(pose, list | tuple) else ()
+    is_pose = len(numbers) == 7 and all(is_number(each) for each in numbers)
+    if not is_pose or abs(math.hypot(*numbers[3:]) - 1.0) > 1e-9:
+        raise RecordingError(
+            f"event 'reset' at tick {event.get('tick')!r} is damaged: its pose is {shown(pose)}"
+        )
+    return numbers
+
+
 class EventApplier:
     """Applies events of commands and inputs to a live or simulated run.
 
@@ -526,7 +553,7 @@ class EventApplier:
         data: mujoco.MjData,
         method: Method,
         start: bytes,
-        slow: SlowScene | None = None,
+        slow: SlowScene | PostedScene | None = None,
     ) -> None:
         self._hands, self._data, self._slow = tuple(hands), data, slow
         self._method, self._start = method, start
@@ -541,7 +568,14 @@ class EventApplier:
         if kind == "reset":
             if not self._method.has_coupling:
                 raise RecordingError(f"event 'reset': method '{self._method.name}' has no reset")
-            self._reset()
+            pose = pose_in(event)
+            [(bound, parameters), *_] = self._hands
+            if (pose is None) == (parameters.credit > 0.0):
+                raise RecordingError("event 'reset' is damaged: it belongs to another kind of run")
+            if pose is None:
+                self._reset()
+            else:
+                bound.handle_reset(pose)
             return
         if kind not in CHANGES:
             return
@@ -617,6 +651,7 @@ class CommandQueue:
     Args:
         limits: Limits of the coupling on each hand's device, by the hand's grip.
         is_recorded: True for a recorded run, which can be marked.
+        is_posted: True if another program steps the scene, which it alone can reset.
         now: Returns the time in s of the run; it never runs backwards.
 
     Attributes:
@@ -630,11 +665,12 @@ class CommandQueue:
         limits: Mapping[str, CouplingLimits],
         *,
         is_recorded: bool = True,
+        is_posted: bool = False,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.limits, self.now = dict(limits), now
         self.waiting: deque[tuple[Command | Repeat | Hold, str]] = deque(maxlen=MAX_WAITING)
-        self._is_recorded = is_recorded
+        self._is_recorded, self._is_posted = is_recorded, is_posted
         self._offering = threading.Lock()  # never taken by the loop
         self._last = self._last_reset = -float("inf")
 
@@ -698,6 +734,8 @@ class CommandQueue:
             grips = self.grips_of(command)
             if isinstance(command, Couple):
                 self.limits[grips[0]].check(command)
+        elif isinstance(command, Reset) and self._is_posted:
+            raise CommandError("another program steps the scene; reset it there")
         elif isinstance(command, Reset) and not method.has_coupling:
             raise CommandError("a massless tool follows the hand, so there is nothing to reset")
         elif isinstance(command, Mark) and not self._is_recorded:

@@ -646,6 +646,7 @@ class RunSetup(StepTimes):
             device_origin=IDENTITY_POSE if is_absolute else pose,
             handle_origin=IDENTITY_POSE if is_absolute else self.scene.grip_pose(),
             device_start=pose,
+            credit=self.scene.credit,
             scheme=self.method.scheme,
             is_rigid=self.method.is_rigid,
             effective=effective,

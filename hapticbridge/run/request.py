@@ -152,6 +152,7 @@ class UncompiledScene:
 
     grip: str
     other_grips: tuple[str, ...] = ()
+    credit: float = 0.0
 
     def of_hand(self, hand: int) -> UncompiledScene:
         """Returns the scene as one of its hands holds it."""
@@ -212,7 +213,7 @@ def setups_of(meta: Mapping[str, str], scene: Scene | None = None) -> tuple[RunS
         if is_slow and not isinstance(first.coupling, Coupling):
             first = replace(first, coupling=requested_of(meta))
         request = replace(request, grasps=tuple(_with_ratios((first, *others), stored)))
-        scene = cast(Scene, UncompiledScene(grips[0], grips[1:]))
+        scene = cast(Scene, UncompiledScene(grips[0], grips[1:], stored[0].credit))
     with refused_request():
         setups = request.resolve(scene, scene_ticks=ticks)
     return tuple(

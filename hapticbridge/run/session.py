@@ -67,8 +67,10 @@ from hapticbridge.run.description import (
 )
 from hapticbridge.run.hands import DeviceGroup
 from hapticbridge.run.options import RunSetup
+from hapticbridge.run.posted_scene import EVENT as SHOWN_EVENT
+from hapticbridge.run.posted_scene import PostedScene
 from hapticbridge.run.request import RunRequest
-from hapticbridge.run.slow_scene import MAX_WAIT, SlowScene
+from hapticbridge.run.slow_scene import SlowScene
 from hapticbridge.run.summary import RunOutcome, Summary, hand_energy
 from hapticbridge.run.unpacked import warn_of_other_scene
 from hapticbridge.scene import Scene
@@ -84,10 +86,11 @@ SUSPENDED_NS = 50_000_000
 power is unknown. A smaller value could end a run without a sleep, because the two clocks are read
 microseconds apart."""
 
-CHECK_PERIOD, PICTURE_PERIOD = 0.1, 1 / 30
-"""Time in s between two checks of the recorder, and between two pictures for an observer, which
-include a check. A recorded run ends with its recorder; a longer period finds its end later. An eye
-sees no more pictures. Check and picture cost the loop 4 µs each after the wrench was sent."""
+CHECK_PERIOD, PICTURE_PERIOD, NOTE_PERIOD = 0.1, 1 / 30, 0.01
+"""Time in s between two checks of the recorder, between two pictures for an observer, and between
+two events on what another program has shown; the latter two include a check. A recorded run ends
+with its recorder; a longer period finds its end later. An eye sees no more pictures. Check and
+picture cost the loop 4 µs each after the wrench was sent."""
 
 _NO_FORCE = np.zeros(6)
 
@@ -207,7 +210,9 @@ class TickKernel:
         self.external_flags = np.zeros(1, np.int64)  # each hand's state has its own
         self.wrench = hands.state["loop"]["wrench_on_device"]
 
-    def bind(self, bound: BoundKernel, setup: RunSetup, slow: SlowScene | None) -> None:
+    def bind(
+        self, bound: BoundKernel, setup: RunSetup, slow: SlowScene | PostedScene | None
+    ) -> None:
         """Attaches the arrays of a scene and the steps of a method."""
         self.bound, self.step, self.substeps = bound, bound.step, range(setup.substeps)
         self.state, self.row = bound.state, bound.row
@@ -256,7 +261,8 @@ class Session:
         commands: Queue of commands.
         executor: Execution of the queue's commands.
         inputs: Waiting changes of the scene's inputs.
-        slow: Loop of a scene that is slower than the bridge's; None without one.
+        beside: Scene beside the bridge's loop: one that is slower, or another program's; None for a
+            scene in the loop.
         mark: The mark button; None without one.
         tick: Number of the next tick.
         end: Tick before which the run ends; −1 for none.
@@ -291,11 +297,14 @@ class Session:
         self._before_trip = np.empty(0, TICK_DTYPE)
         self._grants: tuple[Grant, ...] = ()
         self._is_begun = self._is_held = self._has_warned = False
-        self.slow: SlowScene | None = None
+        self.beside: SlowScene | PostedScene | None = None
         self.inputs: deque[list[Write]] = deque()
         limits = {each.scene.grip: each.coupling_limits for each in self._setups}
         self.commands = CommandQueue(
-            limits, is_recorded=output.path is not None, now=lambda: 1e-9 * clock.now()
+            limits,
+            is_recorded=output.path is not None,
+            is_posted=self.setup.scene.credit > 0.0,
+            now=lambda: 1e-9 * clock.now(),
         )
         with ExitStack() as resources:
             resources.callback(device.close)  # ``_open`` says why it is called twice
@@ -359,14 +368,29 @@ class Session:
             self.commands.warm_up()
         bounds = (self.kernel.hands or bound).hands
         parts = tuple(zip(bounds, self.hand_parameters, strict=True))
-        self._applier = EventApplier(parts, scene.data, setup.method, start, self.slow)
+        self._applier = EventApplier(parts, scene.data, setup.method, start, self.beside)
         fade_ticks = max(each.guard.fade_ticks for each in self._setups)
         self.executor = CommandExecutor(self.commands, self._applier, fade_ticks, self.event)
         self.mark: MarkButton | None = None
         if setup.mark:
             self.mark = MarkButton(setup.mark, sample, lambda: self.event("mark", by="button"))
-        period = CHECK_PERIOD if self._snapshot is None else PICTURE_PERIOD
-        self._chore_ticks = max(round(period / setup.period), 1)
+        self._chore_ticks = max(round(self._chore_period / setup.period), 1)
+
+    @property
+    def slow(self) -> SlowScene | None:
+        """Loop of a scene that is slower than the bridge's; None without one."""
+        return self.beside if isinstance(self.beside, SlowScene) else None
+
+    @property
+    def posted(self) -> PostedScene | None:
+        """Scene that another program steps; None for another scene."""
+        return self.beside if isinstance(self.beside, PostedScene) else None
+
+    @property
+    def _chore_period(self) -> float:
+        if self.posted is not None:
+            return NOTE_PERIOD
+        return CHECK_PERIOD if self._snapshot is None else PICTURE_PERIOD
 
     def _prepare(self, scene: Scene) -> Coupling | None:
         """Prepares the scene, or the same from its recording; returns a weld's coupling."""
@@ -416,11 +440,13 @@ class Session:
             return
         bound = BoundKernel(scene.model, scene.data, parameters)
         resources.callback(bound.release)
-        if parameters.scene_ticks:
-            self.slow = SlowScene(bound, scene.model, scene.data, parameters)
+        if parameters.credit > 0.0:
+            self.beside = PostedScene(bound, parameters)
+        elif parameters.scene_ticks:
+            self.beside = slow = SlowScene(bound, scene.model, scene.data, parameters)
             if not self.clock.may_wait:
-                self.slow.start()
-        self.kernel.bind(bound, self.setup, self.slow)
+                slow.start()
+        self.kernel.bind(bound, self.setup, self.beside)
 
     def _refuse_stretched_start(self) -> None:
         """Refuses an absolute pose of a device that is too far from its grip."""
@@ -452,6 +478,7 @@ class Session:
         if not self.tick and (self.signal or isinstance(error, KeyboardInterrupt)):
             self._is_begun = False
         is_failed = error is not None and self.last_trip is None
+        self._note_shown()
         self.event(
             "stop",
             reason="error" if is_failed else self.stopped_by,
@@ -464,13 +491,13 @@ class Session:
         self._resources.close()
 
     def _close_scene(self) -> None:
-        if self.slow is not None:
-            self.slow.close()
+        if self.beside is not None:
+            self.beside.close()
 
     def _release_scene(self) -> None:
         """Releases the scene, unless a step still works on it."""
         scene = self.setup.scene
-        if self.slow is None or not self.slow.is_running:
+        if self.beside is None or not self.beside.is_running:
             scene.release()
             return
         warnings.warn(
@@ -519,7 +546,7 @@ class Session:
         # a callback that forbids the split may have been set since the bridge was opened
         model, method = self.setup.scene.model, self.setup.method
         self.kernel.is_ahead = (
-            self.setup.is_pipelined and self.slow is None and can_split(model, method.scheme)
+            self.setup.is_pipelined and self.beside is None and can_split(model, method.scheme)
         )
 
     def note_grants(self, grants: tuple[Grant, ...]) -> None:
@@ -595,16 +622,22 @@ class Session:
         """
         if self._snapshot is not None:
             publish = partial(self.kernel.publish_positions, self._snapshot)
-            if self.slow is None:
+            if self.beside is None:
                 publish(self.kernel.bound)
             else:
-                self.slow.note_picture(publish)
+                self.beside.note_picture(publish)
         self.stream.look()
-        if self.slow is not None:
-            self._look_after(self.slow)
+        if self.beside is not None:
+            self._note_shown()
+            self._look_after(self.beside)
         return self.tick + self._chore_ticks
 
-    def _look_after(self, slow: SlowScene) -> None:
+    def _note_shown(self) -> None:
+        """Records what another program has shown since the last call."""
+        if self.posted is not None and (notes := self.posted.take_notes()):
+            self.event(SHOWN_EVENT, **notes)
+
+    def _look_after(self, slow: SlowScene | PostedScene) -> None:
         """Fades the force out while a step of the scene is overdue; warns once it is zero.
 
         While a reset waits for the step, the force is off.
@@ -613,13 +646,9 @@ class Session:
         if is_missing != self._is_held and not self.executor.later:
             self._is_held ^= self.commands.hold(is_missing, "scene")
         lever = self.kernel.bound.state["guard"]["lever"][0]
-        if is_missing and lever == 0.0 and not self._has_warned:
+        if is_missing and lever == 0.0 and not self._has_warned and slow.missing_words:
             self._has_warned = True
-            warnings.warn(
-                f"a step of scene '{self.setup.scene.name}' takes more than {MAX_WAIT:g} s: "
-                "the force is off until it ends; 'hapticbridge check' finds what is slow",
-                stacklevel=2,
-            )
+            warnings.warn(slow.missing_words, stacklevel=2)
 
     def count_losses(self, skipped: int) -> int:
         """Counts skipped deadlines; returns the record's flags for them and for lost records.

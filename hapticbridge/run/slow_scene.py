@@ -110,6 +110,14 @@ class SlowScene:
         return not self.is_idle and self._age[0] * self._loop_period > self._scene_period + MAX_WAIT
 
     @property
+    def missing_words(self) -> str:
+        """Sentence for a user once the force is off for it."""
+        return (
+            f"a step of the scene takes more than {MAX_WAIT:g} s: the force is off until it ends; "
+            "'hapticbridge check' finds what is slow"
+        )
+
+    @property
     def is_running(self) -> bool:
         """True if the thread is alive; after ``close``, if a step did not end."""
         return self._thread is not None and self._thread.is_alive()

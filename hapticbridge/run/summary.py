@@ -32,7 +32,7 @@ from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import TickFlag
-from hapticbridge.units import energy_rows, format_share, format_si, format_wrenches
+from hapticbridge.units import energy_rows, format_energy, format_share, format_si, format_wrenches
 
 # Sentences on the effective coupling and its law
 
@@ -174,6 +174,14 @@ class RunOutcome:
         return self.probed.added_delay(info, period) if self.probed else 0.0
 
 
+def posted_words(credit: float) -> str:
+    """Returns what is known of a run in which another program steps the scene."""
+    return (
+        "another program stepped the scene; whatever it showed, the hand got at most what it put "
+        f"in plus {format_energy(credit)}, where the device meets its condition"
+    )
+
+
 WELD = "the weld in its stiffest directions at the start"
 """Words for what the stiffness and damping of a run without a coupling law are those of."""
 
@@ -233,6 +241,7 @@ class Summary:
             without handle and force; None without such a limit.
         has_hand: True if the device gives its force to a hand; a prescribed motion does not.
         start_potential: Potential energy in J before the first tick; its zero is arbitrary.
+        credit: Energy in J that another program's scene may give to the hand; 0 for another scene.
         grip: Name of the grip that the hand holds.
         device: Name of the device.
         trip: Stop by the guard; None without one.
@@ -266,6 +275,7 @@ class Summary:
     reach: float | None
     has_hand: bool
     start_potential: float = 0.0
+    credit: float = 0.0
     grip: str = ""
     device: str = ""
     trip: Trip | None = None
@@ -343,6 +353,9 @@ class Summary:
         since = f", from tick {tick} on" if port else ""
         judged = "" if port else "environment "  # the device has a line of its own
         until = ", then the guard stopped the run" if self.trip else ""
+        if self.credit and not port:
+            yield f"{self.verdict}{until}: {posted_words(self.credit)}"
+            return
         yield f"{judged}{self.verdict} ({port or self.environment}){until}{since}{used}"
         if self.method != default_method().name:
             yield f"method {self.method}: {self.about}"
@@ -382,10 +395,14 @@ class Summary:
         yield "peak", peak + reached
         if self.reach is not None:
             yield "reach", f"{format_si(self.reach, 'm')}; beyond, no handle and no force"
-        yield from energy_rows(self.energies, self.start_potential)
+        energies = dict(self.energies)
+        if self.credit:
+            left = format_energy(energies.pop("potential"))
+            yield "tank", f"{left}, what the program may still give to the hand"
+        yield from energy_rows(energies, self.start_potential)
         if self.max_net_energy > INSTANT:
             yield "net to the hand", self.hand_energy.sentence
-        elif release := self.hand_energy.release:
+        elif not self.credit and (release := self.hand_energy.release):
             yield "scene's storage", release
         if blur := self.hand_energy.blur:
             yield "encoder steps", blur
@@ -503,6 +520,7 @@ class Summary:
             reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,
             has_hand=not info.is_prescribed,
             start_potential=outcome.start_potential,
+            credit=parameters.credit,
             trip=outcome.trip,
             probe=outcome.probed.words if outcome.probed else "",
             grip=parameters.grip,

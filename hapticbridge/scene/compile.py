@@ -41,6 +41,10 @@ def custom_numbers(model: mujoco.MjModel, name: str) -> tuple[float, ...]:
     return tuple(model.numeric_data[start : start + size].tolist())
 
 
+PROGRAM_CREDIT = "another_programs_credit"
+"""Custom number of a scene that another program steps: what it may give to a hand, in J."""
+
+
 # Start of a scene, with the handle at the grip
 
 START_KEYFRAME = "home"

@@ -34,7 +34,7 @@ from hapticbridge.kernel.rigid_contact import (
     rigid_margins,
 )
 from hapticbridge.scene.checks import refuse_callbacks
-from hapticbridge.scene.compile import clause, go_to_start
+from hapticbridge.scene.compile import PROGRAM_CREDIT, clause, custom_numbers, go_to_start
 from hapticbridge.scene.handle import (
     add_weld,
     carry_over,
@@ -165,6 +165,11 @@ class Scene:
         It is outdated once the model is replaced (``carry_tool``).
         """
         return self if hand == 0 else replace(self, grip=self.other_grips[hand - 1], hand=hand)
+
+    @property
+    def credit(self) -> float:
+        """Energy in J that a scene of another program may give to a hand; 0 for another scene."""
+        return next(iter(custom_numbers(self.model, PROGRAM_CREDIT)), 0.0)
 
     @property
     def has_several_hands(self) -> bool:

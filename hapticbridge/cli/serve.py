@@ -1,0 +1,135 @@
+"""``hapticbridge serve``."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+
+from hapticbridge.arguments import option
+from hapticbridge.cli.run import announce, refuse_overwriting
+from hapticbridge.cli.terminal import err, notify, out, plain, print_json, working
+from hapticbridge.clock import RealClock
+from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import refuse_simulated_time
+from hapticbridge.program.device_loop import TOKEN_VARIABLE
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.endpoint import CREDIT, PROGRAM_RATE, Endpoint, GrantedClock, posted_scene
+from hapticbridge.run.options import AUTO, DEFAULT_OPTIONS, BridgeOptions
+from hapticbridge.run.programs import prepare_run, words
+from hapticbridge.signals import interrupting_on_signals
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Serve:
+    """Run a device's loop for another program, which steps the scene.
+
+    The program shows its tool with hapticbridge.DeviceLoop, which starts this command itself on its
+    own machine. Here it is for another one: DeviceLoop("remote:HOST:PORT"). Ctrl-C ends the loop.
+
+    Example:
+        hapticbridge serve falcon --host 0.0.0.0 --port 8750 --record demo.mcap
+    """
+
+    FIRST_OPTIONS: ClassVar = (
+        "device",
+        "host",
+        "port",
+        "record",
+        "credit",
+        "scene_rate",
+        "scale",
+        "clutch",
+    )
+
+    device: str = option("simulated", metavar="DEVICE", is_positional=True)
+    """A device, as for 'hapticbridge run --device'."""
+    host: str = "127.0.0.1"
+    """Address on which the loop listens; 0.0.0.0 for the whole network. The token proves who calls;
+    what is told is not secret."""
+    port: int = option(8750, least=0, most=65535)
+    """Port of the datagrams (UDP); 0 takes any free one."""
+    credit: float = option(CREDIT, unit="J", least=0.0, is_open=True, most=10.0)
+    """Energy that the program may give to the hand beyond what the hand put in. The tool is held
+    back where it would give more."""
+    record: Path | None = None
+    """File to record to (.mcap)."""
+    overwrite: bool = False
+    """Replace the recording of --record if the file exists."""
+    fast: bool = False
+    """Run in simulated time, which the program moves: DeviceLoop(is_simulated=True)."""
+    coupling: Mapping[str, float] = option(gains_of=Coupling)
+    options: BridgeOptions = DEFAULT_OPTIONS
+    as_json: bool = option(False, flag="json")
+    """Print address and summary as JSON, and end when the program leaves."""
+
+    def execute(self) -> int:
+        """Runs the loop; returns the exit code."""
+        refuse_overwriting(self.record, self.device, overwrite=self.overwrite)
+        clock = GrantedClock() if self.fast else RealClock()
+        refuse_simulated_time(self.device, clock)
+        token = os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(18)
+        options = self.options
+        if options.scene_rate == AUTO:
+            options = replace(options, scene_rate=PROGRAM_RATE)
+        is_shown = not self.as_json and err.is_terminal
+        with ExitStack() as stack:
+            interrupts = stack.enter_context(interrupting_on_signals())
+            prepare_run(lambda left: notify(words(left)))
+            with working("opening the device"):
+                bridge = Bridge(
+                    posted_scene(self.credit),
+                    self.device,
+                    self.coupling,
+                    replace(options, live=is_shown),
+                    clock=clock,
+                    recording=self.record,
+                )
+            if not self.as_json:
+                announce(bridge.setup, self.coupling, is_method_chosen=options.method is not None)
+            endpoint = Endpoint(self.host, self.port, token.encode(), self._on_leave(bridge, clock))
+            with working("rehearsing the start of the run"):
+                stack.enter_context(bridge)
+            interrupts.hand_over(bridge.stop_on_signal)
+            endpoint.open(bridge)
+            self._tell(endpoint, token)
+            error: BaseException | None = None
+            try:
+                summary = bridge.run()
+            except BaseException as caught:
+                error = caught
+                raise
+            finally:
+                endpoint.close(error)
+                stack.close()
+                if error is not None and self.as_json:
+                    print_json(bridge.summary().to_dict())
+        if self.as_json:
+            print_json(summary.to_dict() | {"recording": str(self.record or "") or None})
+        else:
+            for line in str(summary).splitlines():
+                out.print(plain(line))
+        return 0 if summary.verdict == "passive" and summary.is_certified is not False else 1
+
+    def _on_leave(self, bridge: Bridge, clock: RealClock | GrantedClock) -> Callable[[], None]:
+        """Returns what is done when the program leaves."""
+
+        def leave() -> None:
+            if self.as_json:
+                bridge.stop("program")
+                if isinstance(clock, GrantedClock):
+                    clock.release()
+
+        return leave
+
+    def _tell(self, endpoint: Endpoint, token: str) -> None:
+        host, port = endpoint.address
+        if self.as_json:
+            print(json.dumps({"host": host, "port": port}), flush=True)
+            return
+        notify(f'the program connects with DeviceLoop("remote:{host}:{port}", token="{token}")')

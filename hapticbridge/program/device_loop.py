@@ -1,0 +1,560 @@
+"""A haptic device for any program: it reads the handle's pose, and shows where its tool is."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticbridge.errors import DeviceLost, HapticBridgeError, SafetyTrip
+from hapticbridge.kernel.record import PLANES, POST_DTYPE, TICK_DTYPE
+from hapticbridge.program.messages import CALL_DTYPE, STATE_DTYPE, VERSION, Call, packed, unpacked
+
+Array = NDArray[np.float64]
+
+TOKEN_VARIABLE, PYTHON_VARIABLE = "HAPTICBRIDGE_TOKEN", "HAPTICBRIDGE_PYTHON"
+"""Environment variables: the token of a loop on another machine, and the Python in whose
+environment hapticbridge is installed with all that its loop needs."""
+
+READY_TIME, ANSWER_TIME, CLOSE_TIME = 300.0, 30.0, 60.0
+"""Longest waits in s: for a loop that starts (the first start compiles), for an answer, and for a
+loop that ends and closes its recording."""
+
+REPEAT = 0.05
+"""Time in s after which a call without an answer is sent again."""
+
+SILENCE = 2.0
+"""Time in s without a word from the loop after which it counts as lost."""
+
+
+class Handle(NamedTuple):
+    """State of the hand, in the program's frame.
+
+    Attributes:
+        position: Position in m, (3,).
+        quaternion: Orientation (w, x, y, z), (4,), w >= 0.
+        velocity: Velocity in m/s and rad/s, (6,), over the last 10 ms.
+        buttons: Bits of the buttons that are held.
+        wrench: Force in N and torque in N m on the device, (6,), in its own frame.
+        is_held: True if the handle follows the device; False while a clutch is held, or no pose was
+            shown for a while.
+    """
+
+    position: Array
+    quaternion: Array
+    velocity: Array
+    buttons: int
+    wrench: Array
+    is_held: bool
+
+    @property
+    def matrix(self) -> Array:
+        """Pose as a matrix, (4, 4)."""
+        result = np.eye(4)
+        result[:3, :3], result[:3, 3] = _matrix_of(self.quaternion), self.position
+        return result
+
+
+class Surface(NamedTuple):
+    """A surface near the tool, which stops it between two poses.
+
+    Attributes:
+        point: The point of the tool that is nearest to the surface, in m, (3,).
+        normal: Direction away from the surface, (3,); its length does not count.
+        gap: Distance from that point to the surface in m, >= 0.
+    """
+
+    point: ArrayLike
+    normal: ArrayLike
+    gap: float = 0.0
+
+
+class DeviceLoop:
+    """Loop of a haptic device at 1 kHz, for a program that steps its own scene at its own rate.
+
+    The hand pulls at the tool's pose that the program shows, through a virtual coupling. Whatever
+    the program shows, and when, the hand gets at most what it put in, plus a credit of 0.05 J. The
+    loop runs in a process of its own; entering the context waits until it runs, leaving it ends
+    the force and closes the recording. Poses are (x, y, z, qw, qx, qy, qz), a position alone, or a
+    4 × 4 matrix, in m. All calls may come from any thread, and none but ``advance`` waits.
+
+        with DeviceLoop("falcon", scale=2.0, recording="demo.mcap") as device:
+            device.show(tool_pose())
+            while True:
+                step(target=device.pose().position)
+                device.show(tool_pose())
+
+    Args:
+        device: A device as for ``hapticbridge run --device``, or ``remote:HOST:PORT`` for a loop
+            that ``hapticbridge serve`` runs on another machine.
+        recording: File to write (``.mcap``), replaced if it is a recording.
+        is_simulated: True for simulated time, which ``advance`` moves: equal in every run.
+        python: Interpreter of the environment that has the loop; by default that of the variable
+            HAPTICBRIDGE_PYTHON, else this one.
+        token: Token of a remote loop, as it prints it; by default that of the variable
+            HAPTICBRIDGE_TOKEN.
+        **options: Options of ``hapticbridge serve``: ``scale``, ``axes``, ``absolute``, ``clutch``,
+            ``stiffness``, ``damping``, ``credit``, ``scene_rate``, ``force_limit`` and so on.
+
+    Attributes:
+        summary: The loop's summary, once it was left; empty for a remote loop.
+
+    Raises:
+        HapticBridgeError: The loop cannot start; the message is its own.
+    """
+
+    def __init__(
+        self,
+        device: str = "simulated",
+        *,
+        recording: str | Path | None = None,
+        is_simulated: bool = False,
+        python: str | Path | None = None,
+        token: str | None = None,
+        **options: Any,
+    ) -> None:
+        self._token = (
+            token or os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(18)
+        ).encode()
+        self._remote = _address(device) if device.startswith("remote:") else None
+        if self._remote and (options or recording or is_simulated or python):
+            raise HapticBridgeError(
+                "options, recording, time and python of a remote loop are those of 'hapticbridge "
+                "serve' there"
+            )
+        chosen = str(python or os.environ.get(PYTHON_VARIABLE) or sys.executable)
+        self._command = [chosen, "-m", "hapticbridge", "serve", device, "--port", "0", "--json"]
+        self._command += [*_flags(options)]
+        self._command += ["--record", str(recording), "--overwrite"] if recording else []
+        self._command += ["--fast"] * is_simulated
+        self._is_simulated = is_simulated
+        self._lock = threading.Lock()
+        self._call = np.zeros(1, CALL_DTYPE)
+        self._call["version"], self._call["sequence"] = VERSION, time.time_ns()
+        self._state: np.void = np.zeros(1, STATE_DTYPE)[0]
+        self._has_state, self._has_shown = threading.Event(), False
+        self._heard = 0.0
+        self._applied, self._shown = np.zeros(6), np.zeros(7)
+        self._process: subprocess.Popen[str] | None = None
+        self._is_closed = False
+        self.summary: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        address = self._remote or self._started()
+        self._socket = socket.socket(
+            socket.AF_INET6 if ":" in address[0] else socket.AF_INET, socket.SOCK_DGRAM
+        )
+        self._socket.connect(address)
+        self._listener = threading.Thread(target=self._listen, name="device loop", daemon=True)
+        self._listener.start()
+        end = time.monotonic() + ANSWER_TIME
+        while not self._has_state.wait(REPEAT):
+            self._send(Call.GREET)
+            if time.monotonic() > end:
+                self.close()
+                host, port = address[:2]
+                raise HapticBridgeError(
+                    f"no device loop answers at {host}:{port}: is 'hapticbridge serve' running "
+                    "there, with this token and version?"
+                )
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    # What a program calls
+
+    def pose(self) -> Handle:
+        """Returns what the hand does now; never waits.
+
+        Raises:
+            SafetyTrip: The guard stopped the loop.
+            DeviceLost: The loop ended, or has not been heard for ``SILENCE``.
+            HapticBridgeError: No pose was shown yet, and the handle begins where the tool is.
+        """
+        state = self._newest()
+        if not self._has_shown:
+            raise HapticBridgeError(
+                "show the tool's pose once before the first pose(): the handle begins there"
+            )
+        return Handle(
+            position=state["handle"][:3].copy(),
+            quaternion=state["handle"][3:].copy(),
+            velocity=state["velocity"].copy(),
+            buttons=int(state["buttons"]),
+            wrench=state["wrench"].copy(),
+            is_held=bool(state["lever"] > 0.0),
+        )
+
+    def show(
+        self,
+        pose: ArrayLike,
+        velocity: ArrayLike | None = None,
+        surfaces: Sequence[Surface] = (),
+        *,
+        is_placed: bool = False,
+    ) -> None:
+        """Shows where the program's tool is; never waits.
+
+        Without a velocity the tool is led to the pose within the time between two calls, so it
+        lags by that time. With one it moves on, and a surface stops it.
+
+        Args:
+            pose: Pose of the tool at its grip.
+            velocity: Velocity of the grip in m/s and angular velocity in rad/s, (3,) or (6,).
+            surfaces: At most ``PLANES`` surfaces near the tool, at this pose.
+            is_placed: True if the tool was put there, as by a reset of the scene: the handle is put
+                there, too, and the force begins anew.
+
+        Raises:
+            HapticBridgeError: A number is missing or not finite.
+        """
+        self._newest()
+        post = self._post(pose, velocity, surfaces)
+        with self._lock:
+            post["work"] = self._call["post"]["work"]
+            self._shown = post["pose"][0].copy()
+            self._call["post"] = post
+            is_first, self._has_shown = not self._has_shown, True
+            self._send(Call.PLACE if is_placed or is_first else Call.SHOW)
+
+    def wrench(self, pose: ArrayLike, velocity: ArrayLike | None = None) -> Array:
+        """Shows the tool, and returns the coupling's wrench on it, (6,) in N and N m.
+
+        Apply it at the grip, in the world frame, until the next call. Its work on the tool is then
+        known, so that the hand feels what the tool feels:
+
+            f = K (h − x) + B (v_h − v), at most the force level;    W += f·δx + τ·δφ
+
+        Args:
+            pose: Pose of the tool at its grip.
+            velocity: Its velocity, as for ``show``; None takes a tool at rest.
+
+        Raises:
+            HapticBridgeError: As for ``show``.
+        """
+        state = self._newest()
+        post = self._post(pose, velocity, ())
+        handle, own = state["handle"], post["pose"][0]
+        with self._lock:
+            work = 0.0
+            if self._has_shown:
+                moved = np.append(own[:3] - self._shown[:3], _turn(self._shown[3:], own[3:]))
+                work = float(self._applied @ moved)
+            stiffness, damping, turning, turn_damping = state["gains"]
+            speed = state["velocity"] - post["velocity"][0]
+            force = stiffness * (handle[:3] - own[:3]) + damping * speed[:3]
+            torque = turning * _turn(own[3:], handle[3:]) + turn_damping * speed[3:]
+            is_first = not self._has_shown
+            share = 0.0 if is_first else float(state["lever"])
+            level, torque_level = state["levels"]
+            self._applied = share * np.append(_within(force, level), _within(torque, torque_level))
+            post["work"] = self._call["post"]["work"] + work
+            self._shown, self._has_shown = own.copy(), True
+            self._call["post"] = post
+            self._send(Call.PLACE if is_first else Call.SHOW)
+            return self._applied.copy()
+
+    def advance(self, seconds: float) -> None:
+        """Lets simulated time go on, and waits until it has.
+
+        Args:
+            seconds: Time in s; whole ticks of it count, at least one.
+
+        Raises:
+            HapticBridgeError: The loop runs in real time.
+            DeviceLost: It does not answer.
+        """
+        if not self._is_simulated:
+            raise HapticBridgeError(
+                "real time goes on by itself; advance() is for is_simulated=True"
+            )
+        state = self._newest()
+        with self._lock:
+            self._call["ticks"] = max(round(seconds / float(state["period"])), 1)
+            self._send(Call.ADVANCE)
+            wanted = int(self._call["sequence"][0])
+        end = time.monotonic() + ANSWER_TIME
+        repeat = time.monotonic() + REPEAT
+        while int(self._state["answered"]) < wanted:
+            self._newest()
+            if time.monotonic() > repeat:  # the same call, so that it counts once
+                repeat = time.monotonic() + REPEAT
+                with self._lock:
+                    self._transmit()
+            if time.monotonic() > end:
+                raise DeviceLost(f"the device loop does not answer for {ANSWER_TIME:g} s")
+            self._has_state.wait(REPEAT)
+            self._has_state.clear()
+
+    @property
+    def credit(self) -> float:
+        """Energy in J that the program may still give to the hand: the tank."""
+        return float(self._newest()["credit"])
+
+    def close(self) -> None:
+        """Ends the force and the loop, and waits until its recording is closed."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        if hasattr(self, "_socket"):
+            with self._lock, suppress(OSError):
+                self._send(Call.LEAVE)
+            self._listener.join(1.0)
+            self._socket.close()
+        if self._process is not None:
+            self._end(self._process)
+
+    # The loop's process
+
+    def _started(self) -> tuple[str, int]:
+        """Starts the loop in a process of its own; returns its address once it runs."""
+        environment = {**os.environ, TOKEN_VARIABLE: self._token.decode()}
+        try:
+            self._process = process = subprocess.Popen(
+                self._command,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                env=environment,
+                start_new_session=True,  # Ctrl-C is the program's; it ends the loop in order
+            )
+        except OSError as error:
+            raise HapticBridgeError(
+                f"the device loop cannot start: {self._command[0]}: {error.strerror}"
+            ) from None
+        assert process.stdout is not None  # it is a pipe
+        self._errors: list[str] = []
+        reader = threading.Thread(target=self._read_errors, args=(process,), daemon=True)
+        reader.start()
+        timer = threading.Timer(READY_TIME, process.kill)
+        timer.start()
+        line = process.stdout.readline()
+        timer.cancel()
+        with suppress(ValueError, KeyError, TypeError):
+            told = json.loads(line)
+            return str(told["host"]), int(told["port"])
+        process.wait(CLOSE_TIME)
+        reader.join(1.0)
+        raise HapticBridgeError(f"the device loop cannot start: {self._last_error()}")
+
+    def _read_errors(self, process: subprocess.Popen[str]) -> None:
+        assert process.stderr is not None  # it is a pipe
+        for line in process.stderr:
+            self._errors.append(line.rstrip())
+            del self._errors[:-20]
+            if "error:" not in line and "safety trip:" not in line:
+                print(line.rstrip(), file=sys.stderr)
+
+    def _last_error(self) -> str:
+        lines = [line.strip() for line in self._errors if line.strip()]
+        return lines[-1].removeprefix("error:").strip() if lines else "it said nothing"
+
+    def _end(self, process: subprocess.Popen[str]) -> None:
+        """Waits for the end of the loop's process; a loop that does not end is stopped."""
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        try:
+            told, _ = process.communicate(timeout=CLOSE_TIME)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            told, _ = process.communicate()
+        with suppress(ValueError):
+            self.summary = json.loads(told)
+
+    # Datagrams
+
+    def _post(
+        self, pose: ArrayLike, velocity: ArrayLike | None, surfaces: Sequence[Surface]
+    ) -> NDArray[np.void]:
+        post = np.zeros(1, POST_DTYPE)
+        post["pose"] = own = _pose(pose, self._state["handle"][3:])
+        if velocity is not None:
+            numbers = _numbers("velocity", velocity)
+            if numbers.shape not in ((3,), (6,)):
+                raise HapticBridgeError(
+                    f"velocity has shape {numbers.shape}; it must be 3 or 6 numbers"
+                )
+            post["has_velocity"], post["velocity"][0, : numbers.size] = 1, numbers
+        if len(surfaces) > PLANES:
+            raise HapticBridgeError(f"{len(surfaces)} surfaces are shown; {PLANES} are the most")
+        post["planes"] = len(surfaces)
+        for k, surface in enumerate(surfaces):
+            normal, part = _numbers("normal", surface.normal), slice(3 * k, 3 * k + 3)
+            if normal.shape != (3,) or not np.any(normal):
+                raise HapticBridgeError("the normal of a surface must be 3 numbers, not all 0")
+            post["normals"][0, part] = normal / np.linalg.norm(normal)
+            post["arms"][0, part] = _numbers("point", surface.point) - own[:3]
+            post["gaps"][0, k] = max(float(_numbers("gap", surface.gap)), 0.0)
+        return post
+
+    def _send(self, call: Call) -> None:
+        self._call["sequence"] += 1
+        self._call["call"] = call
+        self._transmit()
+
+    def _transmit(self) -> None:
+        with suppress(OSError):  # a network that is away may come back
+            self._socket.send(packed(self._call, self._token))
+
+    def _listen(self) -> None:
+        while not self._is_closed:
+            try:
+                data = self._socket.recv(4096)
+            except ConnectionError:  # no loop is at that port yet
+                time.sleep(REPEAT)
+                continue
+            except OSError:
+                return
+            state = unpacked(data, STATE_DTYPE, self._token)
+            if state is not None and state["sequence"] > self._state["sequence"]:
+                self._state, self._heard = state, time.monotonic()
+                self._has_state.set()
+
+    def _newest(self) -> np.void:
+        """Returns the loop's newest state.
+
+        Raises:
+            SafetyTrip: The guard stopped the loop.
+            DeviceLost: It ended otherwise, or is silent.
+        """
+        if self._is_closed or not self._heard:
+            raise HapticBridgeError(
+                "the device loop is not open; open it with 'with DeviceLoop(…)'"
+            )
+        state = self._state
+        if state["is_over"]:
+            words = bytes(state["words"]).decode(errors="replace")
+            if state["is_over"] > 1:
+                raise SafetyTrip(words, np.empty(0, TICK_DTYPE))
+            raise DeviceLost(words)
+        silence = time.monotonic() - self._heard
+        if silence > SILENCE and not self._is_simulated:
+            raise DeviceLost(f"the device loop was not heard for {silence:.1f} s")
+        if self._process is not None and self._process.poll() is not None:
+            raise DeviceLost(f"the device loop ended: {self._last_error()}")
+        return state
+
+
+# Numbers
+
+
+def _address(device: str) -> tuple[str, int]:
+    host, _, port = device.removeprefix("remote:").rpartition(":")
+    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise HapticBridgeError(f"device is '{device}'; a remote loop is remote:HOST:PORT")
+    return host.strip("[]"), int(port)
+
+
+def _flags(options: Mapping[str, Any]) -> Iterator[str]:
+    """Yields the flags of ``hapticbridge serve`` for some options."""
+    for name, value in options.items():
+        flag = name.replace("_", "-")
+        if isinstance(value, bool):
+            yield f"--{flag}" if value else f"--no-{flag}"
+        elif value is not None:
+            yield f"--{flag}"
+            is_many = isinstance(value, Sequence | np.ndarray) and not isinstance(value, str)
+            yield from (map(str, np.ravel(value)) if is_many else (str(value),))
+
+
+def _numbers(name: str, values: ArrayLike) -> Array:
+    try:
+        numbers = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise HapticBridgeError(f"{name} is {values!r}; it must be numbers") from None
+    if not np.all(np.abs(numbers) < 1e9):
+        raise HapticBridgeError(f"{name} is {values!r}; it must be finite, and below 1e9 in size")
+    return numbers
+
+
+def _pose(pose: ArrayLike, orientation: Array) -> Array:
+    """Returns a pose as (x, y, z, qw, qx, qy, qz); a position alone gets the orientation."""
+    numbers = _numbers("pose", pose)
+    if numbers.shape == (4, 4):
+        result = np.append(numbers[:3, 3], _quaternion_of(numbers[:3, :3]))
+    elif numbers.shape == (3,):
+        result = np.append(numbers, orientation)
+    elif numbers.shape == (7,):
+        result = numbers.copy()
+    else:
+        raise HapticBridgeError(
+            f"pose has shape {numbers.shape}; it must be (x, y, z, qw, qx, qy, qz), (x, y, z), or "
+            "a 4 × 4 matrix"
+        )
+    norm = float(np.linalg.norm(result[3:]))
+    if not 0.9 < norm < 1.1:
+        raise HapticBridgeError(
+            f"the pose's quaternion {result[3:].tolist()} has norm {norm:.3g}; it must be 1, in "
+            "the order (w, x, y, z)"
+        )
+    result[3:] /= norm
+    return result
+
+
+def _matrix_of(q: Array) -> Array:
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _quaternion_of(matrix: Array) -> Array:
+    """Returns the quaternion of a rotation matrix, by its largest component."""
+    m = matrix
+    squares = np.array(
+        [
+            1 + m[0, 0] + m[1, 1] + m[2, 2],
+            1 + m[0, 0] - m[1, 1] - m[2, 2],
+            1 - m[0, 0] + m[1, 1] - m[2, 2],
+            1 - m[0, 0] - m[1, 1] + m[2, 2],
+        ]
+    )
+    rows = np.array(
+        [
+            [squares[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], squares[1], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], squares[2], m[1, 2] + m[2, 1]],
+            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], squares[3]],
+        ]
+    )
+    q = rows[int(np.argmax(squares))]
+    return np.asarray(q / np.linalg.norm(q) * (1.0 if q[0] >= 0 else -1.0))
+
+
+def _turn(first: Array, second: Array) -> Array:
+    """Returns the rotation vector in rad from one quaternion to another, in the world frame."""
+    v, u = second[1:], first[1:]
+    vector = first[0] * v - second[0] * u - np.cross(v, u)
+    real, size = float(first @ second), float(np.linalg.norm(vector))
+    sign = -1.0 if real < 0.0 else 1.0
+    angle_ratio = 2.0 if size < 1e-9 else 2.0 * np.arctan2(size, sign * real) / size
+    return np.asarray(sign * angle_ratio * vector)
+
+
+def _within(vector: Array, limit: float) -> Array:
+    size = float(np.linalg.norm(vector))
+    return vector if size <= limit else vector * (limit / size)

@@ -1,0 +1,240 @@
+"""The device's loop as another program reaches it: a port for datagrams, beside the loop's thread.
+
+    program ──call──▶ Endpoint._hear ──post──▶ PostedScene, taken over by the loop
+    program ◀─state── Endpoint._tell ◀─record─ the loop's ring
+
+A thread of its own hears and tells, so the loop neither reads nor writes the network.
+"""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.errors import HapticBridgeError, SafetyTrip
+from hapticbridge.kernel.record import POST_DTYPE
+from hapticbridge.program.messages import (
+    CALL_DTYPE,
+    STATE_DTYPE,
+    VERSION,
+    WORDS,
+    Call,
+    packed,
+    unpacked,
+)
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.commands import Repeat
+from hapticbridge.run.posted_scene import is_post
+from hapticbridge.scene import Scene, load_scene
+from hapticbridge.scene.compile import PROGRAM_CREDIT
+
+CREDIT = 0.05
+"""Usual credit of another program in J: 5 N over 1 cm, a little more than the guard's usual energy
+limit. A smaller one holds the tool back when a program moves it toward the hand."""
+
+PROGRAM_RATE = 50.0
+"""Usual poses per second in Hz of another program, as of a robot's controller or a learner."""
+
+REPORT_PERIOD = 2e-3
+"""Time in s between two messages to the program. A program of 500 Hz misses none."""
+
+SPEED_TIME = 0.01
+"""Time in s over which the handle's velocity is taken."""
+
+LAST_WORDS = 0.3
+"""Time in s for which the end of the run is told again, because a datagram may be lost."""
+
+_TOOL = """<mujoco model="tool of another program">
+  <option gravity="0 0 0"/>
+  <custom><numeric name="{name}" data="{credit!r}"/></custom>
+  <worldbody>
+    <body name="tool">
+      <freejoint/>
+      <geom size="0.01" mass="1" contype="0" conaffinity="0"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+def posted_scene(credit: float) -> Scene:
+    """Returns the scene in front of another program: a tool that is where it is shown.
+
+    ``credit`` is what the program may give to the hand in J, > 0.
+    """
+    text = _TOOL.format(name=PROGRAM_CREDIT, credit=credit)
+    return load_scene(mujoco.MjSpec.from_string(text))
+
+
+class GrantedClock(SimulatedClock):
+    """Simulated time that stands still until ticks are granted.
+
+    Attributes:
+        done: Number of the newest grant of which all ticks have ended.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._granted, self._number, self.done = 0, 0, 0
+        self._is_open, self._wake = False, threading.Condition()
+
+    def grant(self, ticks: int, number: int) -> None:
+        """Lets a number of ticks pass."""
+        with self._wake:
+            self._granted, self._number = self._granted + ticks, number
+            self._wake.notify()
+
+    def release(self) -> None:
+        """Lets time go on, so that a run can end."""
+        with self._wake:
+            self._is_open = True
+            self._wake.notify()
+
+    def wait(self) -> tuple[int, int, int]:
+        """Waits for a granted tick (see ``Clock.wait``)."""
+        with self._wake:
+            if not self._granted:
+                self.done = self._number
+            self._wake.wait_for(lambda: self._granted or self._is_open)
+            self._granted = max(self._granted - 1, 0)
+        return super().wait()
+
+
+class Endpoint:
+    """Port at which a program shows its tool and learns what the hand does.
+
+    Args:
+        host: Address on which it listens.
+        port: Port; 0 takes any free one.
+        token: Token that the program must have.
+        on_leave: Called when the program leaves.
+
+    Attributes:
+        address: Host and port.
+
+    Raises:
+        HapticBridgeError: The address cannot be used.
+    """
+
+    def __init__(
+        self, host: str, port: int, token: bytes, on_leave: Callable[[], None] | None = None
+    ) -> None:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind((host, port))
+        except OSError as error:
+            self._socket.close()
+            raise HapticBridgeError(
+                f"port {port} of '{host}' cannot be used: {error.strerror}"
+            ) from None
+        self.address: tuple[str, int] = self._socket.getsockname()[:2]
+        self._token, self._on_leave = token, on_leave
+        self._peer: Any = None
+        self._newest = 0
+        self._told = np.zeros(1, STATE_DTYPE)
+        self._told["version"] = VERSION
+        self._is_closed = False
+
+    def open(self, bridge: Bridge) -> None:
+        """Begins to hear and tell; the bridge is open."""
+        self._bridge, session = bridge, bridge.session
+        assert session.posted is not None  # the scene is that of ``posted_scene``
+        self._scene, parameters = session.posted, session.parameters
+        self._is_absolute = bridge.setup.workspace.absolute
+        self._told["period"], coupling = parameters.period, bridge.setup.coupling
+        self._told["gains"] = (
+            coupling.stiffness,
+            coupling.damping,
+            coupling.rotational_stiffness,
+            coupling.rotational_damping,
+        )
+        self._told["levels"] = parameters.levels_on_tool
+        self._ticks = max(round(SPEED_TIME / parameters.period), 1)
+        self._thread = threading.Thread(target=self._work, name="endpoint", daemon=True)
+        self._thread.start()
+
+    def close(self, error: BaseException | None = None) -> None:
+        """Tells the program that the run is over, and why; then closes the port."""
+        self._is_closed = True
+        if hasattr(self, "_thread"):
+            self._thread.join()
+            self._told["is_over"] = 2 if isinstance(error, SafetyTrip) else 1
+            words = "the device loop has ended" if error is None else str(error)
+            self._told["words"] = words.encode()[:WORDS]
+            end = time.monotonic() + LAST_WORDS
+            while self._peer is not None and time.monotonic() < end:
+                self._tell()
+                time.sleep(LAST_WORDS / 10)
+        self._socket.close()
+
+    def _work(self) -> None:
+        self._socket.settimeout(REPORT_PERIOD)
+        clock, due = self._bridge.clock, 0.0
+        answered = 0
+        while not self._is_closed:
+            # in time, or a message to a program that is gone comes back as an error
+            with suppress(OSError):
+                data, peer = self._socket.recvfrom(4096)
+                if self._hear(data, peer) and self._on_leave is not None:
+                    self._on_leave()
+            now = time.monotonic()
+            is_answered = isinstance(clock, GrantedClock) and clock.done != answered
+            if self._peer is not None and (now >= due or is_answered):
+                due = now + REPORT_PERIOD
+                if isinstance(clock, GrantedClock):
+                    answered = clock.done
+                    self._told["answered"] = answered
+                self._note_state()
+                self._tell()
+
+    def _hear(self, data: bytes, peer: Any) -> bool:
+        """Takes a call; returns True if the program leaves."""
+        call = unpacked(data, CALL_DTYPE, self._token)
+        if call is None or call["sequence"] <= self._newest:
+            return False
+        self._newest, self._peer = int(call["sequence"]), peer
+        clock, kind = self._bridge.clock, int(call["call"])
+        if kind in (Call.SHOW, Call.PLACE) and is_post(call["post"]):
+            post = np.zeros(1, POST_DTYPE)
+            post[0] = call["post"]
+            if kind == Call.PLACE and not self._is_absolute:
+                placed = {"event": "reset", "pose": post["pose"][0].tolist(), "by": "program"}
+                self._bridge.session.commands.waiting.append((Repeat((placed,)), "program"))
+            self._scene.post(post)
+        elif kind == Call.ADVANCE and isinstance(clock, GrantedClock):
+            clock.grant(max(int(call["ticks"]), 1), self._newest)
+        return kind == Call.LEAVE
+
+    def _note_state(self) -> None:
+        """Notes what the newest tick's record says."""
+        rows: NDArray[np.void] = self._bridge.latest_records(self._ticks + 1)
+        told, state = self._told, self._bridge.session.kernel.state
+        if not len(rows):
+            pose = state["pose"][0]
+            told["handle"][0] = [*pose["handle_position"], *pose["handle_quaternion"]]
+            return
+        first, last = rows[0], rows[-1]
+        told["tick"], told["buttons"], told["lever"] = last["tick"], last["buttons"], last["lever"]
+        told["handle"][0] = [*last["handle_position"], *last["handle_quaternion"]]
+        told["wrench"][0], told["credit"] = last["wrench_on_device"], last["scene_tank"]
+        span = float(last["tick"] - first["tick"]) * float(told["period"][0])
+        moved = last["handle_position"] - first["handle_position"]
+        turned = np.zeros(3)
+        mujoco.mju_subQuat(turned, last["handle_quaternion"], first["handle_quaternion"])
+        mujoco.mju_rotVecQuat(turned, turned.copy(), first["handle_quaternion"])
+        told["velocity"][0] = np.append(moved, turned) / span if span > 0 else 0.0
+
+    def _tell(self) -> None:
+        self._told["sequence"] += 1
+        with suppress(OSError):  # the network is away; the next message may pass
+            self._socket.sendto(packed(self._told, self._token), self._peer)
