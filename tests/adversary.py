@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from posting_program import PostingProgram
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import method_named, prepare
@@ -23,7 +24,8 @@ from hapticbridge.kernel.jit import compiled, direct
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.state import BoundKernel
-from hapticbridge.kernel.tick import shown_tick, whole_tick
+from hapticbridge.kernel.tick import posted_tick, shown_tick, whole_tick
+from hapticbridge.run.endpoint import posted_scene
 from hapticbridge.scene import load_scene
 
 SCENES = (
@@ -60,6 +62,7 @@ HAND_DTYPE = np.dtype(
         ("velocity", "<f8", 6),
         ("net", "<f8"),
         ("most", "<f8"),
+        ("credit", "<f8"),
         ("saturated", "<i8"),
         ("tick", "<i8"),
         ("due", "<i8"),
@@ -169,7 +172,10 @@ def _move_device(
 @compiled
 def _account(state: NDArray[np.void], hand: NDArray[np.void]) -> None:
     s, h = state[0], hand[0]
-    released = min(s.energy.kinetic + s.energy.potential - s.energy.start_energy, 0.0)
+    # another program may give its credit, whatever the kernel says of its tank
+    released = -h.credit
+    if h.credit == 0.0:
+        released = min(s.energy.kinetic + s.energy.potential - s.energy.start_energy, 0.0)
     # a force that was held too long may have given more than its spring held; that is owed
     owed = s.coupling.owed[0] + s.coupling.owed[1]
     h.most = max(h.most, h.net + s.run.force_scale / s.run.scale * (released - owed))
@@ -183,6 +189,7 @@ def _attack(
     hand: NDArray[np.void],
     habits: NDArray[np.float64],
     rng: np.random.Generator,
+    program: PostingProgram | None,
 ) -> int:
     """Runs a chunk; returns the code of the first tick that was refused, else ``OK``.
 
@@ -205,7 +212,9 @@ def _attack(
         if late > 0.0 and rng.random() < 0.3:
             elapsed *= 1.0 + late * rng.random()
         move(state, sample, hand, habits, normals, elapsed)
-        if scene_ticks == 0:
+        if program is not None:
+            is_done = posted_tick(state, sample, program.post(tick), own[0], elapsed)
+        elif scene_ticks == 0:
             is_done = whole_tick(state, sample, own[0], elapsed)
         else:
             is_done = shown_tick(states, own, sample, elapsed, tick >= due)
@@ -237,6 +246,9 @@ class Attack:
         scene_ticks: Ticks per step of a scene slower than the loop; 0 steps it in every tick.
         pays: False shows every result of that scene at once, as a bridge must not.
         is_limited_alone: True limits the force on the device alone, as a bridge must not.
+        is_posted: True lets another program show its tool (``posting_program``), which may give
+            the hand no more than its credit.
+        allowed: Share of that credit that a hand may have; less shows how much of it hands get.
     """
 
     seed: int
@@ -253,6 +265,8 @@ class Attack:
     scene_ticks: int = 0
     pays: bool = True
     is_limited_alone: bool = False
+    is_posted: bool = False
+    allowed: float = 1.0
 
     @classmethod
     def at_random(cls, seed: int, **changes: object) -> Attack:
@@ -280,7 +294,8 @@ class Attack:
         limits = 10 ** rng.uniform(-0.5, 1.2), 10 ** rng.uniform(-2.0, -0.3)
         mass = 10 ** rng.uniform(-1.5, 0.0)
         values: dict[str, Any] = {"mass": mass} if self.scene in HEAVY else {}
-        scene = load_scene(self.scene, **values)
+        credit = 10 ** rng.uniform(-3.0, -0.5) if self.is_posted else 0.0
+        scene = posted_scene(credit) if self.is_posted else load_scene(self.scene, **values)
         step = period * max(self.scene_ticks, 1)
         prepare(scene, strongest, step, 1, method, warns=False)
         start = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
@@ -302,6 +317,7 @@ class Attack:
             device_damping=b,
             device_rotational_damping=b_r,
             scene_ticks=self.scene_ticks,
+            credit=credit,
             guarding=GuardParameters(
                 clutch=1,
                 fade_ticks=max(round(0.02 / period), 1),
@@ -310,13 +326,14 @@ class Attack:
             ),
         )
         kernel = slow = BoundKernel(scene.model, scene.data, parameters)
-        if self.scene_ticks:
+        if self.scene_ticks and not self.is_posted:
             slow = BoundKernel(scene.model, scene.data, parameters.of_scene, kernel)
         if not self.pays:
             kernel.state["shown"]["tank"] = kernel.state["shown"]["passing"] = 1e9
         states, own = (kernel.state, slow.state), (kernel.row, slow.row, np.zeros(1, SAMPLE_DTYPE))
         hand = np.zeros(1, HAND_DTYPE)
         hand["quaternion"][0, 0] = 1.0
+        hand["credit"] = self.allowed * credit
         times = 10 ** rng.uniform([-2.7, -2.7, -1.5], [-0.7, -0.7, 0.3]) / period
         habits = np.array(
             [
@@ -334,6 +351,10 @@ class Attack:
             ]
         )
         draw = np.random.default_rng([self.seed, 2])
+        program = None
+        if self.is_posted:
+            own_choices = np.random.default_rng([self.seed, 3])
+            program = PostingProgram(own_choices, period, kernel)
         code = OK
         for _ in range(ticks // CHUNK):
             if self.presses and rng.random() < 0.1:
@@ -345,10 +366,10 @@ class Attack:
                 law = method.law_coupling(wanted, step)
                 goal, ticks = replace(parameters, coupling=law), max(round(0.02 / period), 1)
                 kernel.tune(goal, method.gains(law, step), ticks)
-                if self.scene_ticks:
+                if self.scene_ticks and not self.is_posted:
                     ticks = max(round(0.02 / step), 1)
                     slow.tune(goal.of_scene, method.gains(law, step), ticks)
-            code = _attack(states, own, hand, habits, draw)
+            code = _attack(states, own, hand, habits, draw, program)
             if code != OK:
                 break
         return float(hand["most"][0]), int(hand["saturated"][0]), code

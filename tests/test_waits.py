@@ -47,8 +47,7 @@ REASONS = {
     "run/endpoint.py: super().wait()": "simulated time waits for nothing",
     "run/endpoint.py: self._thread.join()": "it looks for the end every REPORT_PERIOD",
     "run/endpoint.py: time.sleep(LAST_WORDS / 10)": "until LAST_WORDS is over",
-    "program/device_loop.py: process.stdout.readline()": "the process is killed after READY_TIME",
-    "program/device_loop.py: process.communicate()": "it was killed",
+    "program/loop_process.py: cast(IO[str], process.stdout).readline()": "killed after READY_TIME",
     "program/device_loop.py: time.sleep(REPEAT)": DAEMON,
     # devices and their guardian
     "device/transport/hid.py: self._wake.wait()": f"{DAEMON} longer than MAX_WRITE",

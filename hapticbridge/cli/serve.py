@@ -17,10 +17,10 @@ from hapticbridge.cli.terminal import err, notify, out, plain, print_json, worki
 from hapticbridge.clock import RealClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import refuse_simulated_time
-from hapticbridge.program.device_loop import TOKEN_VARIABLE
+from hapticbridge.program.loop_process import TOKEN_VARIABLE
 from hapticbridge.run.bridge import Bridge
-from hapticbridge.run.endpoint import CREDIT, PROGRAM_RATE, Endpoint, GrantedClock, posted_scene
-from hapticbridge.run.options import AUTO, DEFAULT_OPTIONS, BridgeOptions
+from hapticbridge.run.endpoint import CREDIT, Endpoint, GrantedClock, posted_scene, program_options
+from hapticbridge.run.options import DEFAULT_OPTIONS, BridgeOptions
 from hapticbridge.run.programs import prepare_run, words
 from hapticbridge.signals import interrupting_on_signals
 
@@ -74,9 +74,7 @@ class Serve:
         clock = GrantedClock() if self.fast else RealClock()
         refuse_simulated_time(self.device, clock)
         token = os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(18)
-        options = self.options
-        if options.scene_rate == AUTO:
-            options = replace(options, scene_rate=PROGRAM_RATE)
+        options = program_options(self.options)
         is_shown = not self.as_json and err.is_terminal
         with ExitStack() as stack:
             interrupts = stack.enter_context(interrupting_on_signals())
@@ -91,7 +89,7 @@ class Serve:
                     recording=self.record,
                 )
             if not self.as_json:
-                announce(bridge.setup, self.coupling, is_method_chosen=options.method is not None)
+                announce(bridge.setup, self.coupling, is_method_chosen=False)
             endpoint = Endpoint(self.host, self.port, token.encode(), self._on_leave(bridge, clock))
             with working("rehearsing the start of the run"):
                 stack.enter_context(bridge)

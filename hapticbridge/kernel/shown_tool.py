@@ -278,12 +278,12 @@ def take_posted(state: NDArray[np.void], posts: NDArray[np.void]) -> None:
     store_vector(shown.before[0:3], position)
     store_quaternion(shown.before[3:7], orientation)
     from_position, from_orientation = position, orientation
-    shown.horizon = LONGEST * since
+    shown.horizon, shown.lead = LONGEST * since, 0.0
     for i in range(6):
         shown.acceleration[i] = 0.0
         shown.velocity[i] = post.velocity[i]
     if not post.has_velocity:
-        shown.horizon = since
+        shown.horizon, shown.lead = since, s.run.period
         from_position = vector_of(pose.tool_position)
         from_orientation = quaternion_of(pose.tool_quaternion)
         step = scaled(1.0 / since, subtract(position, from_position))

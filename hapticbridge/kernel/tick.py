@@ -998,6 +998,25 @@ def simulate_shown(
     return int(samples.size)
 
 
+@compiled
+def posted_tick(
+    state: NDArray[np.void],
+    sample: NDArray[np.void],
+    post: NDArray[np.void],
+    row: NDArray[np.void],
+    elapsed: float,
+) -> bool:
+    """Runs one tick in front of another program's scene.
+
+    ``post`` is taken over in it, if it has an element. Returns as ``whole_tick``.
+    """
+    if before_step(state, sample, row, 0, elapsed) != OK:
+        return False
+    if post.size > 0:
+        take_posted(state, post)
+    return after_step(state, row, 0) == OK
+
+
 @compiled_for_threads
 def simulate_posted(
     state: NDArray[np.void],
@@ -1025,14 +1044,11 @@ def simulate_posted(
     external_flags, elapsed, scene_steps = recorded
     for k in range(samples.size):
         s.loop.external_flags = external_flags[k]
-        if before_step(state, samples[k : k + 1], row, 0, elapsed[k]) != OK:
+        place, is_due = s.shown.scene_step, scene_steps[k] > s.shown.scene_step
+        post = posts[place : place + is_due]
+        if post.size < is_due:
             return k
-        place = s.shown.scene_step
-        if scene_steps[k] > place:
-            if place >= posts.size:
-                return k
-            take_posted(state, posts[place : place + 1])
-        if after_step(state, row, 0) != OK:
+        if not posted_tick(state, samples[k : k + 1], post, row, elapsed[k]):
             return k
         rows[k] = row[0]
     return int(samples.size)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import secrets
-import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -22,17 +19,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.errors import DeviceLost, HapticBridgeError, SafetyTrip
 from hapticbridge.kernel.record import PLANES, POST_DTYPE, TICK_DTYPE
+from hapticbridge.program.loop_process import TOKEN_VARIABLE, LoopProcess
 from hapticbridge.program.messages import CALL_DTYPE, STATE_DTYPE, VERSION, Call, packed, unpacked
+from hapticbridge.program.poses import matrix_of, numbers_of, pose_of, turn_between
 
 Array = NDArray[np.float64]
 
-TOKEN_VARIABLE, PYTHON_VARIABLE = "HAPTICBRIDGE_TOKEN", "HAPTICBRIDGE_PYTHON"
-"""Environment variables: the token of a loop on another machine, and the Python in whose
-environment hapticbridge is installed with all that its loop needs."""
+PYTHON_VARIABLE = "HAPTICBRIDGE_PYTHON"
+"""Environment variable with the Python in whose environment hapticbridge is installed with all that
+its loop needs."""
 
-READY_TIME, ANSWER_TIME, CLOSE_TIME = 300.0, 30.0, 60.0
-"""Longest waits in s: for a loop that starts (the first start compiles), for an answer, and for a
-loop that ends and closes its recording."""
+ANSWER_TIME = 30.0
+"""Longest wait in s for an answer of the loop."""
 
 REPEAT = 0.05
 """Time in s after which a call without an answer is sent again."""
@@ -65,7 +63,7 @@ class Handle(NamedTuple):
     def matrix(self) -> Array:
         """Pose as a matrix, (4, 4)."""
         result = np.eye(4)
-        result[:3, :3], result[:3, 3] = _matrix_of(self.quaternion), self.position
+        result[:3, :3], result[:3, 3] = matrix_of(self.quaternion), self.position
         return result
 
 
@@ -137,11 +135,11 @@ class DeviceLoop:
                 "serve' there"
             )
         chosen = str(python or os.environ.get(PYTHON_VARIABLE) or sys.executable)
-        self._command = [chosen, "-m", "hapticbridge", "serve", device, "--port", "0", "--json"]
-        self._command += [*_flags(options)]
-        self._command += ["--record", str(recording), "--overwrite"] if recording else []
-        self._command += ["--fast"] * is_simulated
-        self._is_simulated = is_simulated
+        command = [chosen, "-m", "hapticbridge", "serve", device, "--port", "0", "--json"]
+        command += _flags(options)
+        command += ["--record", str(recording), "--overwrite"] if recording else []
+        command += ["--fast"] * is_simulated
+        self._process = None if self._remote else LoopProcess(command, self._token.decode())
         self._lock = threading.Lock()
         self._call = np.zeros(1, CALL_DTYPE)
         self._call["version"], self._call["sequence"] = VERSION, time.time_ns()
@@ -149,12 +147,11 @@ class DeviceLoop:
         self._has_state, self._has_shown = threading.Event(), False
         self._heard = 0.0
         self._applied, self._shown = np.zeros(6), np.zeros(7)
-        self._process: subprocess.Popen[str] | None = None
-        self._is_closed = False
+        self._is_closed, self._placed = False, 0
         self.summary: dict[str, Any] = {}
 
     def __enter__(self) -> Self:
-        address = self._remote or self._started()
+        address = self._remote or (self._process.start() if self._process else ("", 0))
         self._socket = socket.socket(
             socket.AF_INET6 if ":" in address[0] else socket.AF_INET, socket.SOCK_DGRAM
         )
@@ -196,10 +193,11 @@ class DeviceLoop:
             raise HapticBridgeError(
                 "show the tool's pose once before the first pose(): the handle begins there"
             )
+        handle, velocity = self._handle_in(state)
         return Handle(
-            position=state["handle"][:3].copy(),
-            quaternion=state["handle"][3:].copy(),
-            velocity=state["velocity"].copy(),
+            position=handle[:3].copy(),
+            quaternion=handle[3:].copy(),
+            velocity=velocity.copy(),
             buttons=int(state["buttons"]),
             wrench=state["wrench"].copy(),
             is_held=bool(state["lever"] > 0.0),
@@ -235,7 +233,7 @@ class DeviceLoop:
             self._shown = post["pose"][0].copy()
             self._call["post"] = post
             is_first, self._has_shown = not self._has_shown, True
-            self._send(Call.PLACE if is_placed or is_first else Call.SHOW)
+            self._send_pose(is_placed=is_placed or is_first)
 
     def wrench(self, pose: ArrayLike, velocity: ArrayLike | None = None) -> Array:
         """Shows the tool, and returns the coupling's wrench on it, (6,) in N and N m.
@@ -254,16 +252,16 @@ class DeviceLoop:
         """
         state = self._newest()
         post = self._post(pose, velocity, ())
-        handle, own = state["handle"], post["pose"][0]
+        (handle, velocity_of_handle), own = self._handle_in(state), post["pose"][0]
         with self._lock:
             work = 0.0
             if self._has_shown:
-                moved = np.append(own[:3] - self._shown[:3], _turn(self._shown[3:], own[3:]))
+                moved = np.append(own[:3] - self._shown[:3], turn_between(self._shown[3:], own[3:]))
                 work = float(self._applied @ moved)
             stiffness, damping, turning, turn_damping = state["gains"]
-            speed = state["velocity"] - post["velocity"][0]
+            speed = velocity_of_handle - post["velocity"][0]
             force = stiffness * (handle[:3] - own[:3]) + damping * speed[:3]
-            torque = turning * _turn(own[3:], handle[3:]) + turn_damping * speed[3:]
+            torque = turning * turn_between(own[3:], handle[3:]) + turn_damping * speed[3:]
             is_first = not self._has_shown
             share = 0.0 if is_first else float(state["lever"])
             level, torque_level = state["levels"]
@@ -271,7 +269,7 @@ class DeviceLoop:
             post["work"] = self._call["post"]["work"] + work
             self._shown, self._has_shown = own.copy(), True
             self._call["post"] = post
-            self._send(Call.PLACE if is_first else Call.SHOW)
+            self._send_pose(is_placed=is_first)
             return self._applied.copy()
 
     def advance(self, seconds: float) -> None:
@@ -284,11 +282,11 @@ class DeviceLoop:
             HapticBridgeError: The loop runs in real time.
             DeviceLost: It does not answer.
         """
-        if not self._is_simulated:
+        state = self._newest()
+        if not state["is_simulated"]:
             raise HapticBridgeError(
                 "real time goes on by itself; advance() is for is_simulated=True"
             )
-        state = self._newest()
         with self._lock:
             self._call["ticks"] = max(round(seconds / float(state["period"])), 1)
             self._send(Call.ADVANCE)
@@ -322,64 +320,7 @@ class DeviceLoop:
             self._listener.join(1.0)
             self._socket.close()
         if self._process is not None:
-            self._end(self._process)
-
-    # The loop's process
-
-    def _started(self) -> tuple[str, int]:
-        """Starts the loop in a process of its own; returns its address once it runs."""
-        environment = {**os.environ, TOKEN_VARIABLE: self._token.decode()}
-        try:
-            self._process = process = subprocess.Popen(
-                self._command,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-                env=environment,
-                start_new_session=True,  # Ctrl-C is the program's; it ends the loop in order
-            )
-        except OSError as error:
-            raise HapticBridgeError(
-                f"the device loop cannot start: {self._command[0]}: {error.strerror}"
-            ) from None
-        assert process.stdout is not None  # it is a pipe
-        self._errors: list[str] = []
-        reader = threading.Thread(target=self._read_errors, args=(process,), daemon=True)
-        reader.start()
-        timer = threading.Timer(READY_TIME, process.kill)
-        timer.start()
-        line = process.stdout.readline()
-        timer.cancel()
-        with suppress(ValueError, KeyError, TypeError):
-            told = json.loads(line)
-            return str(told["host"]), int(told["port"])
-        process.wait(CLOSE_TIME)
-        reader.join(1.0)
-        raise HapticBridgeError(f"the device loop cannot start: {self._last_error()}")
-
-    def _read_errors(self, process: subprocess.Popen[str]) -> None:
-        assert process.stderr is not None  # it is a pipe
-        for line in process.stderr:
-            self._errors.append(line.rstrip())
-            del self._errors[:-20]
-            if "error:" not in line and "safety trip:" not in line:
-                print(line.rstrip(), file=sys.stderr)
-
-    def _last_error(self) -> str:
-        lines = [line.strip() for line in self._errors if line.strip()]
-        return lines[-1].removeprefix("error:").strip() if lines else "it said nothing"
-
-    def _end(self, process: subprocess.Popen[str]) -> None:
-        """Waits for the end of the loop's process; a loop that does not end is stopped."""
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-        try:
-            told, _ = process.communicate(timeout=CLOSE_TIME)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            told, _ = process.communicate()
-        with suppress(ValueError):
-            self.summary = json.loads(told)
+            self.summary = self._process.end()
 
     # Datagrams
 
@@ -387,9 +328,9 @@ class DeviceLoop:
         self, pose: ArrayLike, velocity: ArrayLike | None, surfaces: Sequence[Surface]
     ) -> NDArray[np.void]:
         post = np.zeros(1, POST_DTYPE)
-        post["pose"] = own = _pose(pose, self._state["handle"][3:])
+        post["pose"] = own = pose_of(pose, self._state["handle"][3:])
         if velocity is not None:
-            numbers = _numbers("velocity", velocity)
+            numbers = numbers_of("velocity", velocity)
             if numbers.shape not in ((3,), (6,)):
                 raise HapticBridgeError(
                     f"velocity has shape {numbers.shape}; it must be 3 or 6 numbers"
@@ -399,13 +340,26 @@ class DeviceLoop:
             raise HapticBridgeError(f"{len(surfaces)} surfaces are shown; {PLANES} are the most")
         post["planes"] = len(surfaces)
         for k, surface in enumerate(surfaces):
-            normal, part = _numbers("normal", surface.normal), slice(3 * k, 3 * k + 3)
+            normal, part = numbers_of("normal", surface.normal), slice(3 * k, 3 * k + 3)
             if normal.shape != (3,) or not np.any(normal):
                 raise HapticBridgeError("the normal of a surface must be 3 numbers, not all 0")
             post["normals"][0, part] = normal / np.linalg.norm(normal)
-            post["arms"][0, part] = _numbers("point", surface.point) - own[:3]
-            post["gaps"][0, k] = max(float(_numbers("gap", surface.gap)), 0.0)
+            post["arms"][0, part] = numbers_of("point", surface.point) - own[:3]
+            post["gaps"][0, k] = max(float(numbers_of("gap", surface.gap)), 0.0)
         return post
+
+    def _handle_in(self, state: np.void) -> tuple[Array, Array]:
+        """Returns pose and velocity of the handle; until it is placed, those that it will have."""
+        if int(state["placed"]) < self._placed:
+            return self._shown, np.zeros(6)
+        return state["handle"], state["velocity"]
+
+    def _send_pose(self, *, is_placed: bool) -> None:
+        """Sends the pose; one that was placed is placed again until the loop has heard of it."""
+        is_pending = int(self._state["placed"]) < self._placed
+        self._send(Call.PLACE if is_placed or is_pending else Call.SHOW)
+        if is_placed:
+            self._placed = int(self._call["sequence"][0])
 
     def _send(self, call: Call) -> None:
         self._call["sequence"] += 1
@@ -448,14 +402,11 @@ class DeviceLoop:
                 raise SafetyTrip(words, np.empty(0, TICK_DTYPE))
             raise DeviceLost(words)
         silence = time.monotonic() - self._heard
-        if silence > SILENCE and not self._is_simulated:
+        if silence > SILENCE and not state["is_simulated"]:
             raise DeviceLost(f"the device loop was not heard for {silence:.1f} s")
-        if self._process is not None and self._process.poll() is not None:
-            raise DeviceLost(f"the device loop ended: {self._last_error()}")
+        if self._process is not None and not self._process.is_running:
+            raise DeviceLost(f"the device loop ended: {self._process.last_error}")
         return state
-
-
-# Numbers
 
 
 def _address(device: str) -> tuple[str, int]:
@@ -475,84 +426,6 @@ def _flags(options: Mapping[str, Any]) -> Iterator[str]:
             yield f"--{flag}"
             is_many = isinstance(value, Sequence | np.ndarray) and not isinstance(value, str)
             yield from (map(str, np.ravel(value)) if is_many else (str(value),))
-
-
-def _numbers(name: str, values: ArrayLike) -> Array:
-    try:
-        numbers = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise HapticBridgeError(f"{name} is {values!r}; it must be numbers") from None
-    if not np.all(np.abs(numbers) < 1e9):
-        raise HapticBridgeError(f"{name} is {values!r}; it must be finite, and below 1e9 in size")
-    return numbers
-
-
-def _pose(pose: ArrayLike, orientation: Array) -> Array:
-    """Returns a pose as (x, y, z, qw, qx, qy, qz); a position alone gets the orientation."""
-    numbers = _numbers("pose", pose)
-    if numbers.shape == (4, 4):
-        result = np.append(numbers[:3, 3], _quaternion_of(numbers[:3, :3]))
-    elif numbers.shape == (3,):
-        result = np.append(numbers, orientation)
-    elif numbers.shape == (7,):
-        result = numbers.copy()
-    else:
-        raise HapticBridgeError(
-            f"pose has shape {numbers.shape}; it must be (x, y, z, qw, qx, qy, qz), (x, y, z), or "
-            "a 4 × 4 matrix"
-        )
-    norm = float(np.linalg.norm(result[3:]))
-    if not 0.9 < norm < 1.1:
-        raise HapticBridgeError(
-            f"the pose's quaternion {result[3:].tolist()} has norm {norm:.3g}; it must be 1, in "
-            "the order (w, x, y, z)"
-        )
-    result[3:] /= norm
-    return result
-
-
-def _matrix_of(q: Array) -> Array:
-    w, x, y, z = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def _quaternion_of(matrix: Array) -> Array:
-    """Returns the quaternion of a rotation matrix, by its largest component."""
-    m = matrix
-    squares = np.array(
-        [
-            1 + m[0, 0] + m[1, 1] + m[2, 2],
-            1 + m[0, 0] - m[1, 1] - m[2, 2],
-            1 - m[0, 0] + m[1, 1] - m[2, 2],
-            1 - m[0, 0] - m[1, 1] + m[2, 2],
-        ]
-    )
-    rows = np.array(
-        [
-            [squares[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [m[2, 1] - m[1, 2], squares[1], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
-            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], squares[2], m[1, 2] + m[2, 1]],
-            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], squares[3]],
-        ]
-    )
-    q = rows[int(np.argmax(squares))]
-    return np.asarray(q / np.linalg.norm(q) * (1.0 if q[0] >= 0 else -1.0))
-
-
-def _turn(first: Array, second: Array) -> Array:
-    """Returns the rotation vector in rad from one quaternion to another, in the world frame."""
-    v, u = second[1:], first[1:]
-    vector = first[0] * v - second[0] * u - np.cross(v, u)
-    real, size = float(first @ second), float(np.linalg.norm(vector))
-    sign = -1.0 if real < 0.0 else 1.0
-    angle_ratio = 2.0 if size < 1e-9 else 2.0 * np.arctan2(size, sign * real) / size
-    return np.asarray(sign * angle_ratio * vector)
 
 
 def _within(vector: Array, limit: float) -> Array:

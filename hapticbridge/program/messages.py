@@ -61,7 +61,9 @@ STATE_DTYPE = np.dtype(
         ("version", "<i8"),
         ("sequence", "<i8"),
         ("answered", "<i8"),
+        ("placed", "<i8"),
         ("is_over", "<i8"),
+        ("is_simulated", "<i8"),
         ("tick", "<i8"),
         ("buttons", "<i8"),
         ("lever", "<f8"),
@@ -75,11 +77,12 @@ STATE_DTYPE = np.dtype(
         ("words", f"S{WORDS}"),
     ]
 )
-"""From the loop to the program: number of the message, of the newest ADVANCE that is done, 1 at the
-end of the run, tick, bits of the buttons, share of the wrench that is sent (0 while the handle does
-not follow), T in s, what the tank holds in J, the handle's pose and velocity in the program's
-frame, the wrench on the device in N and N m, the requested K, B, K_r, B_r, the coupling's levels on
-the tool in N and N m, and why the run ended."""
+"""From the loop to the program: number of the message, of the newest ADVANCE and a PLACE that are
+done, 1 at the end of the run and 2 at one by the guard, 1 if the time is simulated, tick, bits of
+the buttons, share of the wrench that is sent (0 while the handle does not follow), T in s, the tank
+in J, the handle's pose and velocity in the program's frame, the wrench on the device in N and N m,
+the requested K, B, K_r, B_r, the coupling's levels on the tool in N and N m, and why the run
+ended."""
 
 
 def packed(record: NDArray[np.void], token: bytes) -> bytes:

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -33,6 +34,7 @@ from hapticbridge.program.messages import (
 )
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.commands import Repeat
+from hapticbridge.run.options import AUTO, BridgeOptions
 from hapticbridge.run.posted_scene import is_post
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.compile import PROGRAM_CREDIT
@@ -43,6 +45,9 @@ limit. A smaller one holds the tool back when a program moves it toward the hand
 
 PROGRAM_RATE = 50.0
 """Usual poses per second in Hz of another program, as of a robot's controller or a learner."""
+
+PROGRAM_METHOD = "implicit"
+"""Method with which the law's damping is the requested one."""
 
 REPORT_PERIOD = 2e-3
 """Time in s between two messages to the program. A program of 500 Hz misses none."""
@@ -73,6 +78,19 @@ def posted_scene(credit: float) -> Scene:
     """
     text = _TOOL.format(name=PROGRAM_CREDIT, credit=credit)
     return load_scene(mujoco.MjSpec.from_string(text))
+
+
+def program_options(options: BridgeOptions) -> BridgeOptions:
+    """Returns options for another program's scene, of which the law is the coupling itself.
+
+    Raises:
+        HapticBridgeError: An option is for a scene that the bridge steps.
+    """
+    for name in ("method", "contact", "substeps"):
+        if getattr(options, name) is not None:
+            raise HapticBridgeError(f"{name} is for a scene that hapticbridge steps; leave it out")
+    rate = PROGRAM_RATE if options.scene_rate == AUTO else options.scene_rate
+    return replace(options, method=PROGRAM_METHOD, scene_rate=rate)
 
 
 class GrantedClock(SimulatedClock):
@@ -141,6 +159,7 @@ class Endpoint:
         self._token, self._on_leave = token, on_leave
         self._peer: Any = None
         self._newest = 0
+        self._placed = 0, 0  # number of the call, and tick after which it is done
         self._told = np.zeros(1, STATE_DTYPE)
         self._told["version"] = VERSION
         self._is_closed = False
@@ -159,6 +178,7 @@ class Endpoint:
             coupling.rotational_damping,
         )
         self._told["levels"] = parameters.levels_on_tool
+        self._told["is_simulated"] = isinstance(bridge.clock, GrantedClock)
         self._ticks = max(round(SPEED_TIME / parameters.period), 1)
         self._thread = threading.Thread(target=self._work, name="endpoint", daemon=True)
         self._thread.start()
@@ -210,6 +230,8 @@ class Endpoint:
             if kind == Call.PLACE and not self._is_absolute:
                 placed = {"event": "reset", "pose": post["pose"][0].tolist(), "by": "program"}
                 self._bridge.session.commands.waiting.append((Repeat((placed,)), "program"))
+            if kind == Call.PLACE and self._told["placed"] == self._placed[0]:
+                self._placed = self._newest, self._bridge.session.tick + 1
             self._scene.post(post)
         elif kind == Call.ADVANCE and isinstance(clock, GrantedClock):
             clock.grant(max(int(call["ticks"]), 1), self._newest)
@@ -219,6 +241,8 @@ class Endpoint:
         """Notes what the newest tick's record says."""
         rows: NDArray[np.void] = self._bridge.latest_records(self._ticks + 1)
         told, state = self._told, self._bridge.session.kernel.state
+        if self._bridge.session.tick > self._placed[1]:
+            told["placed"] = self._placed[0]
         if not len(rows):
             pose = state["pose"][0]
             told["handle"][0] = [*pose["handle_position"], *pose["handle_quaternion"]]

@@ -1,0 +1,293 @@
+"""A scene that another program steps: no hand gets more than the credit, bit for bit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from adversary import UNPAID, Attack
+from numpy.typing import NDArray
+
+from hapticbridge import Bridge, BridgeOptions, SimulatedClock, Summary, audit
+from hapticbridge.audit import AuditReport
+from hapticbridge.errors import CommandError, HapticBridgeError
+from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.record import POST_DTYPE
+from hapticbridge.recording import read_recording
+from hapticbridge.run.commands import Couple, Repeat, Reset, Switch
+from hapticbridge.run.endpoint import posted_scene, program_options
+from hapticbridge.run.posted_scene import EVENT
+
+CREDIT = 0.05
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+def attack(seed: int, **changes: Any) -> float:
+    """Returns the most energy in J that a hand got from a program beyond its credit."""
+    energy, _, code = Attack.at_random(seed, is_posted=True, scene_ticks=20, **changes).run()
+    assert code == OK
+    return energy
+
+
+def test_no_hand_gets_more_from_a_program_than_its_credit() -> None:
+    assert max(attack(seed) for seed in range(150)) <= UNPAID
+
+
+def test_hands_do_get_most_of_the_credit() -> None:
+    assert max(attack(seed, allowed=0.5) for seed in range(150)) > UNPAID
+
+
+def test_a_program_that_nobody_pays_for_is_seen_to_give_joules() -> None:
+    assert max(attack(seed, pays=False) for seed in range(60)) > 1.0
+
+
+def post_of(position: Any, quaternion: Any = UPRIGHT, **values: Any) -> NDArray[np.void]:
+    """Returns a post of a pose."""
+    post = np.zeros(1, POST_DTYPE)
+    post["pose"] = [*position, *quaternion]
+    for name, value in values.items():
+        post[name] = value
+    return post
+
+
+Program = Callable[[Bridge, int], None]
+
+
+def run(program: Program, path: Path | None = None, duration: float = 2.0, **options: Any) -> Any:
+    """Runs a program before each tick of a simulated hand; returns summary and records."""
+    device = options.pop("device", "simulated")
+    scene = posted_scene(options.pop("credit", CREDIT))
+    own = program_options(BridgeOptions(**options))
+    with Bridge(scene, device, None, own, clock=SimulatedClock(), recording=path) as bridge:
+        summary = bridge.run(duration, lambda tick: program(bridge, tick))
+        records = bridge.latest_records(round(duration * 1000))
+    return summary, records
+
+
+def shows(bridge: Bridge, post: NDArray[np.void]) -> None:
+    assert bridge.session.posted is not None
+    bridge.session.posted.post(post)
+
+
+def handle_of(bridge: Bridge) -> NDArray[np.float64]:
+    pose = bridge.session.kernel.state["pose"][0]
+    return np.array(pose["handle_position"])
+
+
+def follows(bridge: Bridge, tick: int) -> None:
+    """A program of 50 Hz whose tool is where the handle was."""
+    if tick % 20 == 0:
+        shows(bridge, post_of(handle_of(bridge)))
+
+
+def judged(path: Path) -> AuditReport:
+    return audit(path, in_process=True)
+
+
+def places(bridge: Bridge, position: tuple[float, ...]) -> None:
+    event = {"event": "reset", "pose": [*position, *UPRIGHT], "by": "program"}
+    bridge.session.commands.waiting.append((Repeat((event,)), "program"))
+
+
+# The tool is shown where the program says
+
+
+def test_without_velocity_the_tool_arrives_after_one_interval() -> None:
+    def steps(bridge: Bridge, tick: int) -> None:
+        if tick % 20 == 0:
+            shows(bridge, post_of((1e-4 * (tick >= 100), 0.0, 0.0)))
+
+    _, records = run(steps, duration=0.2, device="simulated:hand=none", credit=1.0)
+    x = records["tool_position"][:, 0]
+    assert np.all(x[:100] == 0.0)
+    assert x[109] == pytest.approx(0.5e-4)
+    assert x[119:] == pytest.approx(1e-4)
+
+
+def test_with_a_velocity_it_moves_on_and_a_surface_stops_it() -> None:
+    def moves(bridge: Bridge, tick: int) -> None:
+        if tick == 0:
+            wall = {"planes": 1, "normals": 0.0, "arms": 0.0, "gaps": 0.0}
+            post = post_of((0.0, 0.0, 0.0), **wall)
+            post["has_velocity"], post["velocity"][0, 0] = 1, 0.01
+            post["normals"][0, :3], post["gaps"][0, 0] = (-1.0, 0.0, 0.0), 2e-5
+            shows(bridge, post)
+
+    _, records = run(moves, duration=0.05, device="simulated:hand=none", credit=1.0)
+    x = records["tool_position"][:, 0]
+    assert x[1] == pytest.approx(1e-5)
+    assert x[3:] == pytest.approx(2e-5)
+
+
+def test_a_program_without_a_word_lets_the_force_fade_and_come_back() -> None:
+    def pauses(bridge: Bridge, tick: int) -> None:
+        if not 500 < tick < 1200:
+            follows(bridge, tick)
+
+    with pytest.warns(UserWarning, match=r"no pose for 0\.25 s"):
+        _, records = run(pauses, duration=2.0)
+    lever = records["lever"]
+    assert lever[480] == 1.0
+    assert np.all(lever[1000:1200] == 0.0)
+    assert np.all(records["wrench_on_device"][1000:1200] == 0.0)
+    assert lever[-1] == 1.0
+
+
+def test_before_the_first_pose_there_is_no_force() -> None:
+    _, records = run(lambda bridge, tick: None, duration=1.0)
+    assert np.all(records["wrench_on_device"][200:] == 0.0)
+    assert np.all(records["scene_tank"] == CREDIT)
+
+
+# The account
+
+
+def test_a_tool_that_is_pulled_away_stops_where_the_credit_ends() -> None:
+    """The spring to a hand that is held takes ½ K d², and the damper (B/T) d² of one step."""
+
+    def pulls(bridge: Bridge, tick: int) -> None:
+        if tick % 20 == 0:
+            shows(bridge, post_of((0.0 if tick < 300 else 0.3, 0.0, 0.0)))
+
+    summary, records = run(pulls, device="simulated:hand=none,friction=100", duration=1.5)
+    away = float(records["tool_position"][-1, 0] - records["handle_position"][-1, 0])
+    law = summary.coupling.law
+    expected = math.sqrt(CREDIT / (0.5 * law.stiffness + law.damping / 1e-3))
+    assert away == pytest.approx(expected, rel=0.01)
+    assert records["scene_tank"][-1] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_work_that_the_program_states_is_taken_from_the_tank_and_given_back() -> None:
+    def states(bridge: Bridge, tick: int) -> None:
+        if tick in (0, 100, 200, 300):
+            work = {0: 0.0, 100: 0.02, 200: 0.01, 300: -5.0}[tick]
+            shows(bridge, post_of((0.0, 0.0, 0.0), work=work))
+
+    _, records = run(states, device="simulated:hand=none", duration=0.4)
+    tank = records["scene_tank"][[99, 199, 299, 399]]
+    assert tank == pytest.approx([0.05, 0.03, 0.04, 0.05], abs=1e-6)
+
+
+def test_the_summary_says_what_is_known_and_the_audit_says_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    summary, records = run(follows, path)
+    report = judged(path)
+    known = "another program stepped the scene"
+    assert isinstance(summary, Summary)
+    assert known in str(summary)
+    assert "environment passive" not in str(summary)
+    assert (report.verdict, report.agreement) == ("passive", "bit for bit")
+    assert known in report.sentence
+    assert "50 mJ" in report.sentence
+    assert report.credit == summary.credit == CREDIT
+    assert report.certified
+    assert summary.timekeeping.shown_rate == pytest.approx(50.0, rel=0.01)
+    assert records["scene_step"][-1] == 100
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_run_is_repeated_to_the_bit(tmp_path: Path, seed: int) -> None:
+    """Poses at random, places, pauses, couplings and switches in any order."""
+    rng = np.random.default_rng(seed)
+
+    def acts(bridge: Bridge, tick: int) -> None:
+        if rng.random() < 0.05 and not 800 < tick < 1300:
+            position = handle_of(bridge) + 0.01 * rng.standard_normal(3)
+            q = np.array([1.0, *0.1 * rng.standard_normal(3)])
+            post = post_of(position, q / np.linalg.norm(q), work=0.01 * rng.standard_normal())
+            if rng.random() < 0.5:
+                post["has_velocity"], post["velocity"] = 1, 0.05 * rng.standard_normal(6)
+            if rng.random() < 0.3:
+                normal = rng.standard_normal(3)
+                post["planes"], post["gaps"][0, 0] = 1, 1e-3
+                post["normals"][0, :3] = normal / np.linalg.norm(normal)
+            shows(bridge, post)
+        if rng.random() < 0.003:
+            places(bridge, tuple(0.02 * rng.standard_normal(3)))
+        if tick % 200 == 100:
+            command = rng.choice(["couple", "off", "on"])
+            bridge.command(
+                Couple(500.0 + 200.0 * rng.random(), 0.5)
+                if command == "couple"
+                else Switch(force=bool(command == "on"))
+            )
+
+    path = tmp_path / "run.mcap"
+    with pytest.warns(UserWarning, match="no pose"):
+        run(acts, path)
+    report = judged(path)
+    assert (report.verdict, report.agreement) == ("passive", "bit for bit"), report.reason
+
+
+def test_a_reset_is_the_programs_own(tmp_path: Path) -> None:
+    def resets(bridge: Bridge, tick: int) -> None:
+        follows(bridge, tick)
+        if tick == 100:
+            with pytest.raises(CommandError, match="another program steps the scene; reset it"):
+                bridge.command(Reset())
+        if tick == 700:
+            places(bridge, (0.5, 0.0, 0.1))
+            shows(bridge, post_of((0.5, 0.0, 0.1)))
+
+    _, records = run(resets, tmp_path / "run.mcap")
+    assert np.linalg.norm(records["handle_position"][701] - (0.5, 0.0, 0.1)) < 1e-3
+    assert records["lever"][699] == 1.0
+    assert records["lever"][700] < 0.05
+    assert np.linalg.norm(records["wrench_on_tool"][700:1000, :3], axis=1).max() < 10.0
+    assert judged(tmp_path / "run.mcap").agreement == "bit for bit"
+
+
+# What was changed is found
+
+
+def changed(path: Path, change: Callable[[list[dict[str, Any]], Any], None]) -> AuditReport:
+    """Returns the audit of a recording whose events or records were changed."""
+    from hapticbridge.recording.reader import read_with_attachments
+    from hapticbridge.recording.writer import rewrite
+
+    recording, attachments = read_with_attachments(path)
+    events, ticks = [dict(event) for event in recording.events], recording.ticks.copy()
+    change(events, ticks)
+    other = path.with_name("changed.mcap")
+    rewrite(recording, attachments, other, [ticks], events)
+    return judged(other)
+
+
+def test_a_post_that_was_changed_left_out_or_damaged_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    run(follows, path, duration=0.5)
+    recording = read_recording(path)
+    assert sum(e.get("count", 0) for e in recording.events if e["event"] == EVENT) == 25
+
+    def first(events: list[dict[str, Any]]) -> dict[str, Any]:
+        return next(event for event in events[20:] if event["event"] == EVENT)
+
+    def alters(events: list[dict[str, Any]], _: Any) -> None:
+        import base64
+
+        posts = np.frombuffer(base64.b64decode(first(events)["posts"]), POST_DTYPE).copy()
+        posts["pose"][:, 0] += 1e-3
+        first(events)["posts"] = base64.b64encode(posts.tobytes()).decode()
+
+    def damages(events: list[dict[str, Any]], _: Any) -> None:
+        first(events)["posts"] = "no posts"
+
+    def omits(events: list[dict[str, Any]], _: Any) -> None:
+        events.remove(first(events))
+
+    def enriches(_: Any, ticks: Any) -> None:
+        ticks["scene_tank"] += 0.01
+        ticks["potential"] += 0.01
+
+    assert changed(path, lambda events, ticks: None).verdict == "passive"
+    for change in (alters, damages, omits, enriches):
+        assert changed(path, change).verdict == "invalid", change
+
+
+def test_a_credit_of_nothing_is_refused() -> None:
+    with pytest.raises(HapticBridgeError):
+        run(follows, credit=-1.0)
