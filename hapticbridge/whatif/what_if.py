@@ -183,6 +183,11 @@ def what_ifs(
     report = judge(path)
     if report.verdict == "invalid":
         raise RecordingError(f"an invalid recording cannot be simulated again: {report.reason}")
+    if report.credit:
+        raise RecordingError(
+            f"another program stepped the scene of '{report.path}': what it would have shown under "
+            "other settings is not known"
+        )
     recordings = read_hands(path)
     with TemporaryDirectory(prefix="hapticbridge-") as name:
         folder = Path(name)
