@@ -51,7 +51,7 @@ def test_tables_of_measurements_are_written_from_what_was_measured() -> None:
     merit = runpy.run_path(str(ROOT / "scripts" / "merit"))
     kept = json.loads(merit["FILE"].read_text(encoding="utf-8"))
     guide = "hapticbridge/guide"
-    pages = ("faults", "rigid_contact", "slower_scenes")
+    pages = ("faults", "own_loop", "rigid_contact", "slower_scenes")
     files = {"README.md", *(f"{guide}/{page}.md" for page in pages)}
     assert {table.file for table in merit["TABLES"]} == files
     for table in merit["TABLES"]:
