@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hapticbridge import audit
 from hapticbridge.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -84,14 +85,18 @@ def test_every_fault_and_broken_condition_that_was_tried_is_in_one_row() -> None
         assert sorted(names) == sorted(kept[tried]["found"])
 
 
-def test_python_block_runs(workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (code,) = blocks("python")
+def test_python_blocks_run(workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names: dict[str, object] = {}
-    exec(compile(code, "README.md", "exec"), names)
-    assert "passive bit for bit" in capsys.readouterr().out
+    for code in blocks("python"):
+        exec(compile(code, "README.md", "exec"), names)
+    assert capsys.readouterr().out.split()[1] == "passive"
     ticks = names["ticks"]
     assert isinstance(ticks, np.ndarray)
     assert len(ticks) == 10_000
+    report = audit("own.mcap")
+    assert (report.verdict, report.agreement) == ("passive", "bit for bit")
+    assert report.credit == 0.05
+    assert report.ticks >= 1000
 
 
 def test_shell_commands_are_valid(workplace: Path) -> None:

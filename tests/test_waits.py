@@ -49,6 +49,8 @@ REASONS = {
     "run/endpoint.py: time.sleep(LAST_WORDS / 10)": "until LAST_WORDS is over",
     "program/loop_process.py: cast(IO[str], process.stdout).readline()": "killed after READY_TIME",
     "program/device_loop.py: time.sleep(REPEAT)": DAEMON,
+    "program/loop_process.py: for line in stream": DAEMON,
+    "program/loop_process.py: told.read()": "the process has ended",
     # devices and their guardian
     "device/transport/hid.py: self._wake.wait()": f"{DAEMON} longer than MAX_WRITE",
     "device/rawhid/serial.py: self._ports.sleep(PAUSE)": "until the time of its caller is over",

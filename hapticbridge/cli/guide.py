@@ -15,7 +15,7 @@ FOLDER = Path(__file__).parent.parent / "guide"
 """Folder of the pages, one Markdown file each, named after its topic."""
 
 TOPICS = {
-    "Tutorials": ("first-run", "own-scene", "own-device", "audit-in-ci"),
+    "Tutorials": ("first-run", "own-scene", "own-loop", "own-device", "audit-in-ci"),
     "How to": (
         "devices",
         "device-package",

@@ -309,6 +309,16 @@ class DeviceLoop:
         """Energy in J that the program may still give to the hand: the tank."""
         return float(self._newest()["credit"])
 
+    @property
+    def work(self) -> float:
+        """Work of ``wrench`` on the program's tool so far, in J, as the loop is told."""
+        return float(self._call["post"]["work"][0])
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the loop's process; None for a remote loop, or before it was started."""
+        return None if self._process is None else self._process.pid
+
     def close(self) -> None:
         """Ends the force and the loop, and waits until its recording is closed."""
         if self._is_closed:

@@ -79,6 +79,11 @@ class LoopProcess:
             timer.cancel()
 
     @property
+    def pid(self) -> int | None:
+        """Number of the process; None before it was started."""
+        return None if self._process is None else self._process.pid
+
+    @property
     def is_running(self) -> bool:
         """True until the process has ended."""
         return self._process is not None and self._process.poll() is None
