@@ -47,7 +47,6 @@ REASONS = {
     "run/endpoint.py: super().wait()": "simulated time waits for nothing",
     "run/endpoint.py: self._thread.join()": "it looks for the end every REPORT_PERIOD",
     "run/endpoint.py: time.sleep(LAST_WORDS / 10)": "until LAST_WORDS is over",
-    "program/loop_process.py: cast(IO[str], process.stdout).readline()": "killed after READY_TIME",
     "program/device_loop.py: time.sleep(REPEAT)": DAEMON,
     "program/loop_process.py: for line in stream": DAEMON,
     "program/loop_process.py: told.read()": "the process has ended",
