@@ -299,6 +299,11 @@ def test_force_limit_of_a_joint_is_each_motors_if_it_has_several(tmp_path: Path)
     assert ranges == [[-0.3, 0.2], [-0.15, 0.1]]
 
 
+def test_force_limit_of_a_joint_without_an_actuator_is_on_none(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, mjcf(body=ARM_UNDER_LIMIT)))
+    assert scene.changes[-1].endswith("→ none, as the scene has no actuator there")
+
+
 def test_force_limit_is_moved_on_the_way_to_the_grip_alone(tmp_path: Path) -> None:
     limit = "actuatorfrcrange='-1 1'"
     outer = f"<body name='stand'><joint name='base' {limit}/><geom size='.01'/>{ARM_UNDER_LIMIT}"

@@ -412,7 +412,7 @@ def _refused(path: Path) -> Iterator[None]:
 
 def _found_nowhere(path: Path, error: Exception) -> str:
     """Returns MuJoCo's words; of a file that it does not find, with the folder it looked in."""
-    if str(error).startswith("Error opening file"):  # MuJoCo's own
+    if str(error).startswith("Error: Error opening file"):  # MuJoCo's own
         places = f"'{path.resolve().parent}' and its meshdir or texturedir, if it names one"
         return f"{clause(error)}, looked for in {places}"
     return clause(error)
