@@ -146,6 +146,7 @@ def table(steps: float, lengths: float, count: int = 30) -> str:
 MISTAKEN = [
     (table(1, 1e3), "spans 19.9 m .* if these are mm, divide them by 1000"),
     (table(1e3, 1e3), "rows 10 s apart, as times in ms have; .* if these are mm"),
+    (table(1e9, 1e3), r"rows 1e\+07 s apart, as times in ns have; .* if these are mm"),
     ("t_ms,x,y,z\n0,0,0,0\n1,0,0,0\n", "'t_ms' looks like ms; .* name the column t"),
     ("t,x_mm,y_mm,z_mm\n0,0,0,0\n1,0,0,0\n", "'x_mm' looks like mm; .* name the column x"),
 ]
@@ -160,12 +161,11 @@ def test_a_file_in_other_units_is_refused_with_the_unit(
         read_motion(tmp_path / "hand.csv")
 
 
-def test_times_that_look_like_ms_are_said_and_run(tmp_path: Path) -> None:
-    (tmp_path / "hand.csv").write_text(table(1e3, 1))
-    with pytest.warns(
-        UserWarning, match=r"rows are 10 s apart, .* if these are ms, divide by 1000"
-    ):
-        assert read_motion(tmp_path / "hand.csv").duration == pytest.approx(290)
+@pytest.mark.parametrize(("unit", "count"), [("ms", 1000), ("µs", 1000000), ("ns", 1000000000)])
+def test_times_in_smaller_units_are_said_and_run(tmp_path: Path, unit: str, count: int) -> None:
+    (tmp_path / "hand.csv").write_text(table(count, 1))
+    with pytest.warns(UserWarning, match=f"rows are .* if these are {unit}, divide by {count}$"):
+        assert read_motion(tmp_path / "hand.csv").duration == pytest.approx(0.29 * count)
 
 
 def test_a_slow_walk_and_a_few_rows_are_no_mistake(tmp_path: Path) -> None:
