@@ -496,8 +496,9 @@ def test_equality_meant_as_a_spring_is_announced_where_it_becomes_rigid(
     tmp_path: Path, solref: str, solimp: float, hertz: float
 ) -> None:
     """ω² = d/(1 − d)/(timeconst dampratio)²; MuJoCo's default is stiffer."""
-    text = f"""<mujoco><worldbody><body name="m" mocap="true" pos="0 .1 .1"/>{_BALL}</worldbody>
-      <equality><weld name="spring" body1="m" body2="t" relpose="0 -.1 0 1 0 0 0"
+    text = f"""<mujoco><worldbody><body name="m" mocap="true" pos="1 .1 .1"/>{_BALL}
+      <body name="u" pos="1 0 .1"><freejoint/><geom size=".02" mass=".1"/></body></worldbody>
+      <equality><weld name="spring" body1="m" body2="u" relpose="0 -.1 0 1 0 0 0"
         solref="{solref}" solimp="{solimp} {solimp} 0.001"/></equality></mujoco>"""
     with started(tmp_path, text) as bridge:
         said = [change for change in bridge.scene.changes if "equality" in change]

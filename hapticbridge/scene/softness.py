@@ -56,7 +56,7 @@ def _springs(model: mujoco.MjModel) -> Iterator[_Springs]:
     rest was not strict (8.7 mJ, within slack).
     """
     obj, everywhere = mujoco.mjtObj, np.ones(model.npair, dtype=bool)
-    is_rigid = model.eq_type <= int(mujoco.mjtEq.mjEQ_TENDON)
+    is_rigid = (model.eq_type <= int(mujoco.mjtEq.mjEQ_TENDON)) & (model.eq_active0 != 0)
     touches = (model.geom_contype | model.geom_conaffinity) != 0
     flex_touches = (model.flex_contype | model.flex_conaffinity) != 0
     kinds: tuple[tuple[str, str, mujoco.mjtObj, str, NDArray[np.bool_]], ...] = (
