@@ -108,7 +108,8 @@ TREATMENTS: dict[str, Treatment] = {
         "flag", "energy", "changed", "enable", "the meter reads it; it moves nothing",
     ),
     "diagonal": Treatment(
-        "flag", "diagexact", "changed", "enable; dry friction creeps otherwise then",
+        "flag", "diagexact", "changed",
+        "enable; dry friction creeps and flexes yield otherwise then",
         "rigid contacts need the exact inertia of each row", is_rigid=True,
     ),
     "autoreset": Treatment(
