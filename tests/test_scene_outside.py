@@ -261,8 +261,8 @@ def test_tool_that_the_device_cannot_hold_is_carried(
     in_hand = ticks["wrench_on_tool"][-1, 2]
     if is_carried:
         assert re.fullmatch(
-            r"weight of the tool: felt → carried \(it pulls with up to 1[01]\.\d N, its first "
-            r"swing included, and the device holds 10 N\)",
+            r"weight of the tool: felt → carried \(within 1 s it pulls with up to 1[01]\.\d N, "
+            r"and the device holds 10 N\)",
             said[0],
         )
         assert abs(in_hand) < 0.2  # it has inertia still, and the hand moves
