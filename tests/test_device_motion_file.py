@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 from audit_cases import recorded
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -113,6 +114,19 @@ def test_a_bag_that_is_no_motion_is_refused_with_what_it_holds(tmp_path: Path) -
         (file,) = bag(tmp_path / f"torn{length}", torn).glob("*.mcap")
         with pytest.raises(DeviceError, match="message 0 of /hand cannot be read"):
             open_device(f"trajectory:{file}")
+
+
+def test_a_bag_that_compresses_each_message_is_told(tmp_path: Path) -> None:
+    packed = [(time, zstandard.compress(message)) for time, message in ramp()]
+    (file,) = bag(tmp_path / "packed", {"/hand": packed}).glob("*.mcap")
+    with pytest.raises(DeviceError, match="the bag compresses each message; 'ros2 bag convert'"):
+        open_device(f"trajectory:{file}")
+
+
+def test_times_that_do_not_increase_are_told_apart(tmp_path: Path) -> None:
+    (tmp_path / "hand.csv").write_text("t,x,y,z\n1700000000.02,0,0,0\n1700000000.01,0,0,0\n")
+    with pytest.raises(DeviceError, match=r"time 1700000000\.01 s after 1700000000\.02 s"):
+        read_motion(tmp_path / "hand.csv")
 
 
 def test_big_endian_poses_are_read(tmp_path: Path) -> None:

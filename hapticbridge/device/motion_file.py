@@ -312,12 +312,18 @@ def _topics(path: Path) -> Iterator[tuple[str, str]]:
         yield channel.topic, schema.name if schema else "no type"
 
 
+_ZSTD = b"\x28\xb5\x2f\xfd"
+"""Start of what Zstandard compressed, as bags of compression mode ``message`` hold."""
+
+
 def _pose_of(data: bytes) -> tuple[int, tuple[float, ...]]:
     """Returns stamp in ns and numbers of a ``PoseStamped``: x, y, z in m, then qx, qy, qz, qw.
 
     It is CDR: two bytes of the encoding, whose last bit says little-endian, two of options; then
     the stamp, the length of the frame's name and the name, and the numbers at a multiple of 8.
     """
+    if data.startswith(_ZSTD):
+        raise ValueError("the bag compresses each message; 'ros2 bag convert' undoes it")
     order = "<" if data[1] & 1 else ">"
     seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
     start = 4 + (12 + length + 7) // 8 * 8
