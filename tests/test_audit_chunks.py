@@ -15,7 +15,9 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import pytest
+import zstandard
 from audit_cases import recorded
 from cli_cases import Called
 from mcap import records
@@ -24,6 +26,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from hapticbridge.audit import audit
+from hapticbridge.errors import RecordingError
 from hapticbridge.recording import read_recording, repair
 from hapticbridge.tools.export import Part, export
 
@@ -157,6 +160,46 @@ def test_a_chunk_that_is_lost_doubled_or_moved_is_found(
     assert not any("checksum" in problem for problem in read_recording(path).problems)
     report = audit(path)
     assert report.verdict == verdict, report.reason
+
+
+# Chunks that another program packed
+
+
+def repacked(run: Path, path: Path, pack: Callable[[bytes], bytes], compression: str) -> Path:
+    """Writes a recording with its chunks packed anew, as ``mcap compress`` does."""
+    parts = Parts.of(run)
+    for chunk, *_ in parts.chunks:
+        unpacked = zstandard.ZstdDecompressor().decompress(chunk.data, chunk.uncompressed_size)
+        chunk.data, chunk.compression = pack(unpacked), compression
+    return parts.write(path)
+
+
+@pytest.mark.parametrize(("compression", "pack"), [("lz4", lz4.frame.compress), ("", bytes)])
+def test_chunks_in_each_compression_of_mcap_are_read(
+    run: Path, tmp_path: Path, compression: str, pack: Callable[[bytes], bytes]
+) -> None:
+    path = repacked(run, tmp_path / "repacked.mcap", pack, compression)
+    assert read_recording(path).problems == ()
+    assert (read_recording(path).ticks == read_recording(run).ticks).all()
+    assert audit(path).verdict == "passive"
+
+
+DAMAGED: dict[str, tuple[Callable[[bytes], bytes], str, str]] = {
+    "cut": (lambda data: lz4.frame.compress(data)[:-40], "lz4", "its checksum does not match"),
+    "torn": (lambda data: lz4.frame.compress(data)[9:], "lz4", "it does not decompress"),
+    "unknown": (lambda data: data, "br", "'br' is not one of 'lz4', 'zstd' and none"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_a_chunk_that_does_not_unpack_is_named(name: str, run: Path, tmp_path: Path) -> None:
+    pack, compression, words = DAMAGED[name]
+    path = repacked(run, tmp_path / "damaged.mcap", pack, compression)
+    if name == "cut":  # what was unpacked is kept
+        assert any(words in problem for problem in read_recording(path).problems)
+        return
+    with pytest.raises(RecordingError, match=rf"no topic /tick; chunk 1 \(at .*{words}"):
+        read_recording(path)
 
 
 # Recordings that lost their end

@@ -302,6 +302,20 @@ def test_motion_that_does_not_end_is_a_fault_and_no_error(tmp_path: Path) -> Non
     assert "not finite after tick" in one_of("motion not finished", find_faults(case)).sentence
 
 
+def test_a_keyframe_of_an_attached_model_is_not_renamed_but_replaced(tmp_path: Path) -> None:
+    part = """<mujoco model="part"><worldbody><body name="arm"><joint name="j" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 .1 0 0" size=".01"/></body>
+        </worldbody><keyframe><key name="home" qpos=".3"/></keyframe></mujoco>"""
+    (tmp_path / "part.xml").write_text(part)
+    (tmp_path / "whole.xml").write_text(
+        '<mujoco><asset><model name="part" file="part.xml"/></asset><worldbody><frame>'
+        '<attach model="part" body="arm" prefix="p_"/></frame><body name="grip" pos="0 1 0">'
+        '<freejoint/><geom size=".02" mass=".1"/></body></worldbody></mujoco>'
+    )
+    fault = one_of("keyframe", faults_of(tmp_path / "whole.xml"))
+    assert '<key name="home" qpos="…"/> in a <keyframe> of whole.xml' in fault.change
+
+
 def test_start_beyond_all_numbers_is_named_at_its_keyframe(tmp_path: Path) -> None:
     plant = Plant("start not finite", "<!-- keys -->", f"<keyframe>{KEY}</keyframe>")
     assert "start not finite" not in kinds(faults_of(bench(tmp_path / "near", plant)))

@@ -29,6 +29,11 @@ def test_a_scene_of_one_s_own_is_shown_whatever_its_grip_is_called(
     code, _, err = call("scenes", path)
     assert code == 2
     assert "error: cannot compile scene" in err
+    mesh = "<asset><mesh name='m' file='m.stl'/></asset><worldbody><geom type='mesh' mesh='m'/>"
+    path.write_text(f"<mujoco>{mesh}</worldbody></mujoco>")
+    code, _, err = call("scenes", path)
+    assert code == 2
+    assert f"'m.stl', looked for in '{tmp_path}' and its meshdir or texturedir" in err
 
 
 def test_a_new_scene_has_no_fault_and_runs(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 from audit_cases import recorded
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -115,6 +116,19 @@ def test_a_bag_that_is_no_motion_is_refused_with_what_it_holds(tmp_path: Path) -
             open_device(f"trajectory:{file}")
 
 
+def test_a_bag_that_compresses_each_message_is_told(tmp_path: Path) -> None:
+    packed = [(time, zstandard.compress(message)) for time, message in ramp()]
+    (file,) = bag(tmp_path / "packed", {"/hand": packed}).glob("*.mcap")
+    with pytest.raises(DeviceError, match="the bag compresses each message; 'ros2 bag convert'"):
+        open_device(f"trajectory:{file}")
+
+
+def test_times_that_do_not_increase_are_told_apart(tmp_path: Path) -> None:
+    (tmp_path / "hand.csv").write_text("t,x,y,z\n1700000000.02,0,0,0\n1700000000.01,0,0,0\n")
+    with pytest.raises(DeviceError, match=r"time 1700000000\.01 s after 1700000000\.02 s"):
+        read_motion(tmp_path / "hand.csv")
+
+
 def test_big_endian_poses_are_read(tmp_path: Path) -> None:
     messages = []
     for i in range(3):
@@ -146,6 +160,7 @@ def table(steps: float, lengths: float, count: int = 30) -> str:
 MISTAKEN = [
     (table(1, 1e3), "spans 19.9 m .* if these are mm, divide them by 1000"),
     (table(1e3, 1e3), "rows 10 s apart, as times in ms have; .* if these are mm"),
+    (table(1e9, 1e3), r"rows 1e\+07 s apart, as times in ns have; .* if these are mm"),
     ("t_ms,x,y,z\n0,0,0,0\n1,0,0,0\n", "'t_ms' looks like ms; .* name the column t"),
     ("t,x_mm,y_mm,z_mm\n0,0,0,0\n1,0,0,0\n", "'x_mm' looks like mm; .* name the column x"),
 ]
@@ -160,12 +175,11 @@ def test_a_file_in_other_units_is_refused_with_the_unit(
         read_motion(tmp_path / "hand.csv")
 
 
-def test_times_that_look_like_ms_are_said_and_run(tmp_path: Path) -> None:
-    (tmp_path / "hand.csv").write_text(table(1e3, 1))
-    with pytest.warns(
-        UserWarning, match=r"rows are 10 s apart, .* if these are ms, divide by 1000"
-    ):
-        assert read_motion(tmp_path / "hand.csv").duration == pytest.approx(290)
+@pytest.mark.parametrize(("unit", "count"), [("ms", 1000), ("µs", 1000000), ("ns", 1000000000)])
+def test_times_in_smaller_units_are_said_and_run(tmp_path: Path, unit: str, count: int) -> None:
+    (tmp_path / "hand.csv").write_text(table(count, 1))
+    with pytest.warns(UserWarning, match=f"rows are .* if these are {unit}, divide by {count}$"):
+        assert read_motion(tmp_path / "hand.csv").duration == pytest.approx(0.29 * count)
 
 
 def test_a_slow_walk_and_a_few_rows_are_no_mistake(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from emulated.handle import Handle
 from emulated.pyusb_backend import PyusbBackend
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.driver import ignore_message
+from hapticbridge.device.driver import FoundDevice, ignore_message, select_device
 from hapticbridge.device.falcon.device import DRIVER, FalconDevice, open_falcon
 from hapticbridge.device.falcon.protocol import READ_FROM, SIZE, WRITE_TO, encode, enter_run_mode
 from hapticbridge.device.transport.trace import HexLog
@@ -159,6 +159,21 @@ def test_of_two_the_serial_number_chooses() -> None:
     with pytest.raises(DeviceError, match="'falcon' has serial 'C3'"):
         open_falcon({"serial": "C3"}, ignore_message, host)
     open_falcon({"serial": "B2"}, ignore_message, host).close()
+
+
+def test_interfaces_that_share_a_serial_number_are_chosen_by_their_paths() -> None:
+    first, second, other = (
+        FoundDevice(
+            driver="it", name="", serial=serial, path=f"/dev/hidraw{number}", transport="hid"
+        )
+        for number, serial in ((2, "A1"), (3, "A1"), (4, "B2"))
+    )
+    plugged, paths = [first, second, other], "one of '/dev/hidraw2', '/dev/hidraw3'"
+    for serial, words in ((None, f"{paths}, 'B2'$"), ("A1", f"{paths}$")):
+        with pytest.raises(DeviceError, match=f"choose one with serial=, {words}"):
+            select_device(DRIVER, plugged, serial)
+    assert select_device(DRIVER, plugged, "/dev/hidraw3") == second
+    assert select_device(DRIVER, plugged, "B2") == other
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
+import numpy as np
 import pytest
 from cli_cases import Called
 from outside_scenes import scene_file
@@ -87,6 +89,35 @@ def test_contacts_are_named_where_they_are_the_cause_and_undone_where_that_mends
     assert found.remedy == RunPoint(NO_HAND, PERIOD, contact="scene")
     assert "--contact scene (tried: " in found.advice(RunPoint(NO_HAND, PERIOD))
     assert "rigid contacts in place of the file's own" in str(found)
+
+
+SOFT_BLOCK = """<mujoco><worldbody><body name="base" pos="0 0 .3"><flexcomp name="soft" dim="3"
+type="grid" count="3 3 3" spacing=".03 .03 .03" mass=".3" radius=".002"><edge equality="true"/>
+<contact selfcollide="none"/><pin id="0 1 2 3 4 5 6 7 8"/></flexcomp></body>
+<body pos="1 0 1"><joint/><geom size=".01" pos="0 0 -.1"/><site name="grip"/></body>
+</worldbody></mujoco>"""
+"""A block whose edges are the equality constraint of a flex, which hangs in its own softness."""
+
+
+def test_the_softness_that_a_run_leaves_to_mujoco_is_not_called_rigid(tmp_path: Path) -> None:
+    source = scene(tmp_path, SOFT_BLOCK)
+    found = moved(source)
+    assert found.causes == (Cause.DIAGONAL,)
+    assert "flag diagexact, which rigid contacts need, here of equality '0'" in str(found)
+    bridged = compile_scene(source)
+    bridged.set_contact(is_rigid=True)
+    assert any("flag diagexact: disable → enable" in each for each in bridged.changes)
+    # this flag alone moves it as far in MuJoCo
+    ends = []
+    for flags in (0, int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT)):
+        model = source.spec.compile()
+        model.opt.enableflags |= flags
+        data = mujoco.MjData(model)
+        mujoco.mj_step(model, data, round(found.seconds / model.opt.timestep))
+        ends.append(data.body(found.deviations[0].body).xpos.copy())
+    apart = float(np.linalg.norm(np.subtract(*ends)))
+    assert apart > 1e-3
+    assert found.deviations[0].apart == pytest.approx(apart, rel=0.02)
 
 
 EDGES = """<mujoco><option timestep="0.001"/><worldbody>

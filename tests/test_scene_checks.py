@@ -257,6 +257,31 @@ def test_mass_that_becomes_infinite_in_compilation_is_refused_with_its_body(tmp_
     assert message.startswith("part.xml, line 2: mass of <geom> is 'nan'")
 
 
+def test_text_in_another_encoding_is_refused_at_its_line_and_a_comment_is_not(
+    tmp_path: Path,
+) -> None:
+    head = '<?xml version="1.0" encoding="{0}"?>\n<!-- Größe -->\n'
+    plain = mjcf(body=FREE_TOOL)
+    named = plain.replace('name="tool"', 'name="Würfel"')
+    for text, encoding, words in (
+        (plain, "latin-1", ""),
+        (named, "utf-8", ""),
+        (named, "latin-1", "scene.xml, line 3: name of <body> is not in UTF-8; save the file in"),
+        (plain, "utf-16", "scene.xml is in UTF-16; save it in UTF-8"),
+    ):
+        path = tmp_path / "scene.xml"
+        path.write_text(head.format(encoding) + text, encoding=encoding)
+        if words:
+            assert refusal(path).startswith(words)
+        else:
+            load_scene(path)
+
+
+def test_a_mesh_is_not_taken_for_a_scene(tmp_path: Path) -> None:
+    (tmp_path / "peg.STL").write_bytes(bytes(84))
+    assert "is a mesh; write an MJCF file that names it" in refusal(tmp_path / "peg.STL")
+
+
 ARM_UNDER_LIMIT = HINGE_TOOL.format(joint="actuatorfrcrange='-0.3 0.2'")
 
 
@@ -297,6 +322,11 @@ def test_force_limit_of_a_joint_is_each_motors_if_it_has_several(tmp_path: Path)
     assert scene.changes[-1].endswith("→ on each of its actuators")
     ranges = scene.model.actuator_forcerange[:2].tolist()
     assert ranges == [[-0.3, 0.2], [-0.15, 0.1]]
+
+
+def test_force_limit_of_a_joint_without_an_actuator_is_on_none(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, mjcf(body=ARM_UNDER_LIMIT)))
+    assert scene.changes[-1].endswith("→ none, as the scene has no actuator there")
 
 
 def test_force_limit_is_moved_on_the_way_to_the_grip_alone(tmp_path: Path) -> None:

@@ -206,6 +206,15 @@ def test_run_without_the_mocap_body_it_replaces_is_audited_bit_for_bit(tmp_path:
     assert hb.audit(tmp_path / "run.mcap").resimulation == "bit for bit"
 
 
+def test_soft_weld_whose_place_the_hand_takes_is_not_said_to_be_rigid(tmp_path: Path) -> None:
+    soft = WELD.replace("/>", ' name="soft" solref="0.1 1"/>')
+    for grip, is_replaced in (("palm", True), ("other", False)):
+        scene = load_scene(scene_file(tmp_path, HELD.format(soft)), grip=grip)
+        scene.set_contact(is_rigid=True)
+        assert (REPLACED in scene.changes) == is_replaced
+        assert any("equality 'soft': a spring of" in each for each in scene.changes) != is_replaced
+
+
 def test_mocap_body_beside_which_the_grip_moves_is_left_and_named(tmp_path: Path) -> None:
     path = scene_file(tmp_path, HELD.format(WELD))
     with pytest.warns(UserWarning, match="'target' holds the tool and leaves the grip 2 of 6 of"):

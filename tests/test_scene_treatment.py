@@ -12,6 +12,8 @@ import pytest
 
 import hapticbridge as hb
 from hapticbridge.cli.guide import page
+from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import method_named, prepare
 from hapticbridge.scene.treatment import TREATMENTS, treatment_table
 
 SCHEMA = Path(__file__).with_name("mjcf_schema.txt")
@@ -129,6 +131,8 @@ DERIVED = {
     "flexedge_J_rownnz": "edges",
     "flex_edgedamping": "edges",
     **{f"{kind}_gap": "gap" for kind in ("geom", "pair", "flex")},
+    "actuator_history": "delays",
+    "sensor_historyadr": "delays",
     "opt.timestep": "time step",
     "opt.integrator": "integrator",
     "opt.solver": "solver",
@@ -211,8 +215,35 @@ def test_a_run_changes_the_values_of_the_table_and_no_others(
     assert expected.keys() - changed == set()
     assert all(TREATMENTS[subject].is_rigid for subject in RIGID.values())
     said = {change.subject for change in scene.differences}
-    silent = {"energy", "autoreset", "gap", "margin"}  # in the table alone
+    silent = {"energy", "autoreset", "gap", "margin", "delays"}  # in the table alone
     assert set(expected.values()) - said == silent & set(expected.values())
+
+
+DELAYED = """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody><body name="tool"
+pos="0 0 1"><freejoint/><geom size=".02" mass=".1"/></body><body><joint name="j" type="slide"/>
+<geom size=".01" mass=".1"/></body></worldbody><actuator><motor joint="j" delay="0.05"
+nsample="26"/></actuator><sensor><jointpos joint="j" delay="0.1" nsample="51"/><jointpos joint="j"
+interval="0.01" delay="0.1" nsample="11"/></sensor><keyframe><key name="home" ctrl="0.1"
+qvel="0 0 0 0 0 0 0.1"/></keyframe></mujoco>"""
+
+
+@pytest.mark.parametrize("method", ["lossless", "weld"])
+@pytest.mark.parametrize(("period", "substeps"), [(0.001, 1), (0.002, 4), (0.005, 1)])
+def test_a_delay_keeps_its_time_at_another_time_step(
+    tmp_path: Path, period: float, substeps: int, method: str
+) -> None:
+    path = tmp_path / "delayed.xml"
+    path.write_text(DELAYED)
+    scene = hb.load_scene(path, grip="tool")
+    for _ in range(2):  # a scene may be prepared again
+        prepare(scene, Coupling(100.0, 1.0, 1.0, 1e-3), period, substeps, method_named(method))
+    own = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(own)
+    mujoco.mj_resetDataKeyframe(own, data, 0)
+    for model, state in ((own, data), (scene.model, scene.data)):
+        mujoco.mj_step(model, state, round(0.4 / model.opt.timestep))
+    assert scene.data.sensordata == pytest.approx(data.sensordata, abs=4e-3)
+    assert scene.data.qvel[-1] == pytest.approx(data.qvel[-1], abs=4e-3)
 
 
 # Motion

@@ -439,3 +439,15 @@ def test_several_values_of_a_setting_stand_side_by_side(wall: Path, call: Called
         "audit", wall, "--what-if", "stiffness=5,9", "--plot", wall.with_name("a.png")
     )
     assert (code, "show one change" in err) == (2, True)
+
+
+def test_a_weight_that_is_carried_in_the_changed_run_alone_is_said(
+    tmp_path: Path, call: Called
+) -> None:
+    heavy = """<mujoco><option timestep="0.001"/><worldbody><body name="tool"><freejoint/>
+        <geom size=".02" mass="0.5"/><site name="grip"/></body></worldbody></mujoco>"""
+    (tmp_path / "heavy.xml").write_text(heavy)
+    recorded(tmp_path / "run.mcap", str(tmp_path / "heavy.xml"), duration=0.1)
+    for change, is_said in (("force_limit=3", True), ("force_limit=9", False)):
+        _, out, _ = call("audit", tmp_path / "run.mcap", "--what-if", change)
+        assert bool(re.search("weight of the tool +felt +carried +carried", out)) == is_said

@@ -96,13 +96,15 @@ def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields a fault if the scene has keyframes but no start among them."""
     names = [str(key.name) for key in case.source.spec.keys]
     if names and START_KEYFRAME not in names:
-        listed = choices(name for name in names if name)
+        listed, place = choices(name for name in names if name), case.places.named("key", names[0])
+        name = f'name="{START_KEYFRAME}"'
+        own = f'<key {name} qpos="…"/> in a <keyframe> of {place.file}'
         yield Fault(
             "keyframe",
-            case.places.named("key", names[0]),
+            place,
             f"the scene has keyframes ({listed}), but none is called '{START_KEYFRAME}': it starts "
             "from the joints' zeros instead",
-            f'name="{START_KEYFRAME}"',
+            name if place.line else f"{own}: those of an attached model get a prefix",
         )
 
 

@@ -16,6 +16,7 @@ from hapticbridge.check.version import SceneVariant
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.scene import SceneSource, read_scene
+from hapticbridge.scene.handle import set_step
 
 
 def trial_facts(trial: VariantVerdict) -> dict[str, str | float | int | None]:
@@ -108,7 +109,7 @@ def write_lean(lean: Lean, path: Path, *, overwrite: bool = False) -> VariantVer
     spec = source.spec.copy()
     _point_to_assets(spec, source, path.absolute().parent)
     setting = lean.draft.setting
-    spec.option.timestep = setting.period / setting.substeps
+    set_step(spec, setting.period / setting.substeps)
     spec.comment = _comment(lean, str(spec.comment or ""))
     try:
         path.write_text(spec.to_xml(), encoding="utf-8")

@@ -11,7 +11,7 @@ from rich.table import Table
 from hapticbridge.arguments import option, shared
 from hapticbridge.cli.terminal import out, plain, print_json, progress
 from hapticbridge.device.discovery import RULES_FILE, blind_spots, plugged_devices, udev_rules
-from hapticbridge.device.driver import RULES_COMMAND, Driver, FoundDevice
+from hapticbridge.device.driver import RULES_COMMAND, Driver, FoundDevice, selector
 from hapticbridge.device.registry import all_drivers, driver_named
 from hapticbridge.device.watchdog import HANG
 from hapticbridge.errors import HapticBridgeError
@@ -137,8 +137,9 @@ def _specification(device: FoundDevice, plugged: list[FoundDevice]) -> str:
         return f"{device.driver}:{device.path}"
     driver = driver_named(device.driver)
     details = [driver.stated] if driver is not None and driver.stated else []
-    if sum(other.driver == device.driver for other in plugged) > 1:
-        details.append(f"serial={device.serial or device.path}")
+    alike = [other for other in plugged if other.driver == device.driver]
+    if len(alike) > 1:
+        details.append(f"serial={selector(device, alike)}")
     return ":".join(filter(None, (device.driver, ",".join(details))))
 
 

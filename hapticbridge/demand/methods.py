@@ -559,8 +559,8 @@ def prepare(
     for gain in fields(Coupling):
         _ARGUMENTS.number(f"coupling {gain.name.replace('_', ' ')}", getattr(coupling, gain.name))
     check_scene(scene.model, scene.grip, method)
-    scene.set_weld(coupling if method.is_weld else None)
     scene.set_timestep(scene_period, substeps)
+    scene.set_weld(coupling if method.is_weld else None)
     scene.model.opt.integrator = _INTEGRATORS[method.integrator]
     scene.set_reach(method.reach)
     scene.set_contact(is_rigid=method.is_rigid)

@@ -183,6 +183,15 @@ def access_problem(path: str) -> str | None:
     return None
 
 
+def selector(device: FoundDevice, plugged: Sequence[FoundDevice]) -> str:
+    """Returns what the option ``serial`` names a device by: its path if it shares its number.
+
+    The interfaces of one wireless receiver have one serial number.
+    """
+    is_shared = sum(each.serial == device.serial for each in plugged) > 1
+    return device.path if is_shared or not device.serial else device.serial
+
+
 def select_device(
     driver: Driver, plugged: Sequence[FoundDevice], serial: object = None
 ) -> FoundDevice:
@@ -209,7 +218,7 @@ def select_device(
             f"no device '{driver.name}' is plugged in (looked for {description}); 'hapticbridge "
             "devices' lists connected devices and missing permissions"
         )
-    names = choices(device.serial or device.path for device in plugged)
+    names = choices(selector(device, plugged) for device in plugged)
     if serial is None:
         if len(plugged) > 1:
             raise DeviceError(
@@ -222,6 +231,12 @@ def select_device(
         if not matching:
             raise DeviceError(
                 f"no device '{driver.name}' has serial '{serial}'; plugged in: {names}"
+            )
+        if len(matching) > 1:
+            paths = choices(each.path for each in matching)
+            raise DeviceError(
+                f"{len(matching)} devices '{driver.name}' have serial '{serial}'; choose one with "
+                f"serial=, one of {paths}"
             )
         device = matching[0]
     if device.problem is not None:

@@ -43,7 +43,7 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
         DeviceError: The file cannot be read, or a line is not valid; the message names it.
 
     Warns:
-        UserWarning: Times look like ms.
+        UserWarning: Times look like ms, µs or ns.
     """
     path = Path(path)
     lines = _read_lines(path)
@@ -176,7 +176,11 @@ MAX_SPAN = 4.0
 walk through a tracked room is slow."""
 
 MAX_STEP = 0.5
-"""Median time in s between rows above which the times of many rows are taken for ms."""
+"""Median time in s between rows above which the times of many rows are taken for ms; a thousand
+times this is taken for µs, and more for ns."""
+
+_SMALLER = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
+"""Number of these units of time in 1 s."""
 
 MANY_ROWS = 20
 """Number of rows from which on their times are judged. Fewer may be single poses, s apart."""
@@ -189,22 +193,25 @@ def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
         DeviceError: Lengths look like mm.
 
     Warns:
-        UserWarning: Times look like ms.
+        UserWarning: Times look like ms, µs or ns.
     """
     steps, ways = np.diff(table[:, 0]), np.linalg.norm(np.diff(table[:, 1:4], axis=0), axis=1)
     span = float(np.ptp(table[:, 1:4], axis=0).max())
-    is_slow = len(table) >= MANY_ROWS and float(np.median(steps)) >= MAX_STEP
-    speed = float(np.median(ways / steps)) * (1e3 if is_slow else 1.0)
+    step = float(np.median(steps))
+    unit = next((unit for unit, count in _SMALLER.items() if step < MAX_STEP * count), "ns")
+    is_slow = len(table) >= MANY_ROWS and step >= MAX_STEP
+    speed = float(np.median(ways / steps)) * (_SMALLER[unit] if is_slow else 1.0)
     if span > MAX_SPAN and speed > USUAL_SPEED_LIMIT:
-        also = f", and rows {np.median(steps):.3g} s apart, as times in ms have" if is_slow else ""
+        also = f", and rows {step:.3g} s apart, as times in {unit} have" if is_slow else ""
         raise DeviceError(
             f"{path}: the motion spans {span:.3g} m at {speed:.3g} m/s{also}; positions are in m "
             "and times in s: if these are mm, divide them by 1000"
         )
     if is_slow:
         warnings.warn(
-            f"{path}: rows are {np.median(steps):.3g} s apart, and the motion takes "
-            f"{np.ptp(table[:, 0]):.3g} s; times are in s: if these are ms, divide by 1000",
+            f"{path}: rows are {step:.3g} s apart, and the motion takes "
+            f"{np.ptp(table[:, 0]):.3g} s; times are in s: if these are {unit}, divide by "
+            f"{_SMALLER[unit]:.0f}",
             stacklevel=3,
         )
     return Motion(table[:, 0], table[:, 1:4], table[:, 4:])
@@ -305,12 +312,18 @@ def _topics(path: Path) -> Iterator[tuple[str, str]]:
         yield channel.topic, schema.name if schema else "no type"
 
 
+_ZSTD = b"\x28\xb5\x2f\xfd"
+"""Start of what Zstandard compressed, as bags of compression mode ``message`` hold."""
+
+
 def _pose_of(data: bytes) -> tuple[int, tuple[float, ...]]:
     """Returns stamp in ns and numbers of a ``PoseStamped``: x, y, z in m, then qx, qy, qz, qw.
 
     It is CDR: two bytes of the encoding, whose last bit says little-endian, two of options; then
     the stamp, the length of the frame's name and the name, and the numbers at a multiple of 8.
     """
+    if data.startswith(_ZSTD):
+        raise ValueError("the bag compresses each message; 'ros2 bag convert' undoes it")
     order = "<" if data[1] & 1 else ">"
     seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
     start = 4 + (12 + length + 7) // 8 * 8

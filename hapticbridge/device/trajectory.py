@@ -121,7 +121,7 @@ def first_fault(table: NDArray[np.float64]) -> tuple[int, str] | None:
         faults.append(
             (
                 row,
-                f"time {times[row]:.9g} s after {times[row - 1]:.9g} s; "
+                f"time {times[row]:.15g} s after {times[row - 1]:.15g} s; "
                 "times must strictly increase",
             )
         )

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
+import lz4.frame
 import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
@@ -381,12 +382,14 @@ def _decompressed(compression: str, packed: bytes, size: int) -> bytes:
         raise DamageError(f"its size of {size} bytes is beyond {MAX_CHUNK_SIZE}")
     if not compression:
         return packed
-    if compression != "zstd":
-        raise DamageError(f"its compression '{compression}' is not one of 'zstd' and none")
+    if compression not in ("lz4", "zstd"):
+        raise DamageError(f"its compression '{compression}' is not one of 'lz4', 'zstd' and none")
     try:
+        if compression == "lz4":
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size))
         # zstandard allocates the size that the frame header claims
         if zstandard.frame_content_size(packed) not in (-1, size):
             raise DamageError("its size does not match")
         return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-    except zstandard.ZstdError as error:
+    except (zstandard.ZstdError, RuntimeError) as error:  # of lz4
         raise DamageError("it does not decompress") from error

@@ -486,7 +486,8 @@ def _read_through(
     if not contents.has_ticks:
         # a file cut inside its first chunk has no schema yet, but has metadata
         if contents.refusal or contents.meta is None or not container.is_cut:
-            reason = contents.refusal or f"it has no topic {layout.TICK_TOPIC}"
+            lacks = f"it has no topic {layout.TICK_TOPIC}"
+            reason = contents.refusal or "; ".join([lacks, *contents.problems[:1]])
             raise RecordingError(f"{path} is not a recording that can be read: {reason}")
     elif contents.meta is None:
         contents.problems.append(f"the metadata record '{layout.METADATA_NAME}' is missing")

@@ -22,6 +22,7 @@ from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.kernel.parameters import MAX_SUBSTEPS
 from hapticbridge.kernel.record import SAMPLE_DTYPE
+from hapticbridge.kernel.rigid_contact import LAST_RIGID
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.scene import Scene, SceneSource, plain_model
@@ -83,6 +84,7 @@ class Cause(Enum):
 
     TIME_STEP = "the time step"
     CONTACT = "rigid contacts in place of the file's own"
+    DIAGONAL = "flag diagexact, which rigid contacts need"
     LOAD = "what is changed in the scene as it is loaded"
     OPTIONS = "the integrator and the solver's options"
 
@@ -175,7 +177,7 @@ class Fidelity:
             )
         more = f", and {len(others)} more bodies deviate" if others else ""
         cause = " and ".join(each.value for each in self.causes)
-        if self.constraint and Cause.CONTACT in self.causes:
+        if self.constraint and {Cause.CONTACT, Cause.DIAGONAL} & set(self.causes):
             cause += f", here of {self.constraint}"
         return (
             f"without a hand, '{first.body}' is after {self.seconds:.2g} s "
@@ -314,7 +316,7 @@ class _FileMotion:
             return found
         way = np.zeros(self.model.nv)
         mujoco.mj_differentiatePos(self.model, way, 1.0, scene.data.qpos, self.last.qpos)
-        constraint = _working(self.last, found.deviations[0].number, way)
+        row = _working(self.last, found.deviations[0].number, way)
         causes: list[Cause] = []
         remedy, more, force = None, 0.0, _force(scene, setting)
         for undone, other in self._settings(scene, setting):
@@ -325,10 +327,12 @@ class _FileMotion:
             if remedy is None and is_calm and not trial.deviations:
                 more = max(_force(scene, other) - force, 0.0)
                 remedy = other if more <= MORE else None
+        if row >= 0 and _is_soft_here(self.last, row):
+            causes = [Cause.DIAGONAL if each is Cause.CONTACT else each for each in causes]
         return replace(
             found,
             causes=tuple(causes) or (self._other_cause(scene, found.deviations[0]),),
-            constraint=constraint,
+            constraint=constraint_name(self.model, self.last, row) if row >= 0 else "",
             remedy=remedy,
             more=more if remedy else 0.0,
         )
@@ -452,10 +456,18 @@ def _force(scene: Scene, setting: RunPoint) -> float:
         return math.inf
 
 
-def _working(data: mujoco.MjData, body: int, way: NDArray[np.float64]) -> str:
-    """Returns the name of the constraint whose force does the most work on a body's joints.
+def _is_soft_here(data: mujoco.MjData, row: int) -> bool:
+    """Returns True for a row of a flex or of dry friction, which rigid contacts leave MuJoCo's."""
+    kind, number = int(data.efc_type[row]), int(data.efc_id[row])
+    if kind == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY):
+        return int(data.model.eq_type[number]) > LAST_RIGID
+    return kind <= int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON)
 
-    ``way`` (nv,) is that of the joints from one place to another; empty if there is no work.
+
+def _working(data: mujoco.MjData, body: int, way: NDArray[np.float64]) -> int:
+    """Returns the constraint row whose force does the most work on a body's joints.
+
+    ``way`` (nv,) is that of the joints from one place to another; -1 if there is no work.
     """
     model = data.model
     rows = np.zeros((data.nefc, model.nv))
@@ -467,7 +479,7 @@ def _working(data: mujoco.MjData, body: int, way: NDArray[np.float64]) -> str:
         rows = data.efc_J.reshape(data.nefc, model.nv)
     chain = np.isin(model.dof_bodyid, ancestors(model, body))
     work = np.abs(data.efc_force * (rows[:, chain] @ way[chain]))
-    return constraint_name(model, data, int(np.argmax(work))) if work.any() else ""
+    return int(np.argmax(work)) if work.any() else -1
 
 
 def _loose_dofs(scene: Scene, start: Places, end: mujoco.MjData) -> NDArray[np.intp]:

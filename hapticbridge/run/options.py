@@ -66,12 +66,14 @@ from hapticbridge.run.commands import CouplingLimits
 from hapticbridge.scene import Scene
 from hapticbridge.scene.physics import site_inertia
 from hapticbridge.scene.rehearsal import (
+    HOLDING_STEPS,
     TIPPED,
     holding_force,
     start_handle,
     static_load,
     toppling_force,
 )
+from hapticbridge.units import format_si
 
 # Options of a user
 
@@ -584,8 +586,8 @@ class RunSetup(StepTimes):
             if (force := min(force, unpowered)) <= most:
                 return ""  # motors push; what they hold of the tool counts for it
             return (
-                f"it pulls with up to {force:.3g} N, its first swing included, and the device "
-                f"holds {most:.3g} N"
+                f"within {format_si(HOLDING_STEPS * parameters.timestep, 's')} it pulls with up to "
+                f"{format_si(force, 'N')}, and the device holds {most:.3g} N"
             )
         if (force := self._sent(toppling_force(scene, parameters))) > most:
             return (

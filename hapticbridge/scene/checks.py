@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import numpy as np
 
 from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, added_actuators, held_body
-from hapticbridge.scene.source import SourceFile, read_elements
+from hapticbridge.scene.source import REPLACED, SourceFile, read_elements
 
 # Requirements of the rendering methods for comparison on a scene
 
@@ -293,6 +294,33 @@ def unmetered_work(model: mujoco.MjModel) -> dict[str, str]:
 
 _MASSES = ("mass", "density", "diaginertia", "fullinertia")
 _FREE_TEXT = ("text", "numeric")  # <custom> elements, which MuJoCo does not compute with
+
+
+def check_text(sources: Iterable[SourceFile]) -> None:
+    """Refuses XML that is not in UTF-8, but for comments: MuJoCo copies its bytes into names.
+
+    Raises:
+        SceneError: Names the file, the line and the attribute.
+    """
+    for source in sources:
+        if not source.name.lower().endswith((".xml", ".urdf")):
+            continue
+        if source.data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            raise SceneError(f"{source.name} is in UTF-16; save it in UTF-8")
+        try:
+            source.data.decode()
+        except UnicodeDecodeError:
+            _refuse_other_bytes(source)
+
+
+def _refuse_other_bytes(source: SourceFile) -> None:
+    for element in read_elements(source.data):
+        for attribute, value in element.attributes.items():
+            if REPLACED in value:
+                raise SceneError(
+                    f"{source.name}, line {element.line}: {attribute} of <{element.tag}> is not in "
+                    "UTF-8; save the file in UTF-8"
+                )
 
 
 def check_numbers(sources: Iterable[SourceFile]) -> None:

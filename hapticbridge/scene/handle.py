@@ -11,6 +11,7 @@ together with the contacts.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import mujoco
@@ -57,7 +58,7 @@ _FLAGS = {
     "equality": mujoco.mjtDisableBit.mjDSBL_EQUALITY,
 }
 
-_NOT_CARRIED = ("name", "text", "tuple", "paths")
+_NOT_CARRIED = ("name", "text", "tuple", "paths", "actuator_history", "sensor_history")
 
 
 def add_weld(spec: mujoco.MjSpec, grip: str) -> None:
@@ -127,6 +128,21 @@ def carry_over(old: mujoco.MjModel, new: mujoco.MjModel) -> None:
             target[...] = value
     for part in ("opt", "stat"):
         copy_values(getattr(old, part), getattr(new, part))
+
+
+def set_step(spec: mujoco.MjSpec, step: float) -> None:
+    """Sets a time step in s, and the samples of each delay so that they span the same time.
+
+    n samples span n − 1 steps, or intervals of a sensor that has longer ones. Fewer would shorten
+    the delay, because MuJoCo returns the oldest sample then.
+    """
+    own = spec.option.timestep
+    for element in (*spec.actuators, *spec.sensors):
+        interval = float(element.interval[0]) if isinstance(element, mujoco.MjsSensor) else 0.0
+        spacing = max(interval, own) / max(interval, step)
+        if element.nsample > 0:
+            element.nsample = 1 + math.ceil((element.nsample - 1) * spacing - 1e-9)
+    spec.option.timestep = step
 
 
 def copy_values(old: object, new: object) -> None:
@@ -395,12 +411,12 @@ def limit_motors_alone(
         data.moment_rowadr,
         data.moment_colind,
     )
-    shared = 0
+    most = 0
     for joint in joints:
         model.jnt_actfrclimited[joint] = 0
         arms = moments[model.actuator_outadr, model.jnt_dofadr[joint]]
         drivers = [i for i in np.flatnonzero(arms).tolist() if i not in added_actuators(model)]
-        shared += len(drivers) > 1
+        most = max(most, len(drivers))
         for actuator in drivers:
             low, high = sorted(model.jnt_actfrcrange[joint] / arms[actuator])
             if model.actuator_forcelimited[actuator]:
@@ -408,8 +424,9 @@ def limit_motors_alone(
                 high = min(high, model.actuator_forcerange[actuator, 1])
             model.actuator_forcelimited[actuator] = 1
             model.actuator_forcerange[actuator] = low, high
-    each = "each of its actuators" if shared else "its actuator"
-    words = f"force limit of joint '{name}'{more}: on all actuators together → on {each}"
+    places = ("none, as the scene has no actuator there", "on its actuator")
+    place = places[most] if most < len(places) else "on each of its actuators"
+    words = f"force limit of joint '{name}'{more}: on all actuators together → {place}"
     return (SceneChange(words, "joint's force limit"),)
 
 

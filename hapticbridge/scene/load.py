@@ -20,6 +20,7 @@ from hapticbridge.scene.checks import (
     check_numbers,
     check_options,
     check_start,
+    check_text,
     refuse_callbacks,
     refuse_overlap,
     unmetered_work,
@@ -182,6 +183,10 @@ def load_scene(
     return compile_scene(_written(spec_source(source)), grip, as_is=as_is, stacklevel=3)
 
 
+_MESHES = ".stl", ".obj", ".msh"
+"""Suffixes of files that MuJoCo opens as a specification without a body."""
+
+
 def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
     """Reads a scene for ``compile_scene``, without adding anything to it.
 
@@ -198,8 +203,13 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
         str(path).encode()
     except UnicodeEncodeError:
         raise SceneError(f"cannot read scene '{path}': MuJoCo needs a name in UTF-8") from None
+    if path.suffix.lower() in _MESHES:
+        raise SceneError(
+            f"scene '{path}' is a mesh; write an MJCF file that names it in <mesh name=… file=…/>"
+        )
     try:
         sources = collect_sources(path)  # first: it refuses what MuJoCo must not open
+        check_text(sources)
         spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
         raise SceneError(f"cannot read scene '{path}': {clause(error)}") from None
@@ -412,7 +422,7 @@ def _refused(path: Path) -> Iterator[None]:
 
 def _found_nowhere(path: Path, error: Exception) -> str:
     """Returns MuJoCo's words; of a file that it does not find, with the folder it looked in."""
-    if str(error).startswith("Error opening file"):  # MuJoCo's own
+    if str(error).startswith("Error: Error opening file"):  # MuJoCo's own
         places = f"'{path.resolve().parent}' and its meshdir or texturedir, if it names one"
         return f"{clause(error)}, looked for in {places}"
     return clause(error)

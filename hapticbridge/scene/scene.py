@@ -39,6 +39,7 @@ from hapticbridge.scene.handle import (
     add_weld,
     carry_over,
     hanging_loads,
+    set_step,
     set_weld_gains,
     tied_trees,
 )
@@ -221,7 +222,8 @@ class Scene:
     def set_timestep(self, scene_period: float, substeps: int = 1) -> None:
         """Sets MuJoCo's timestep to scene_period / substeps, in s.
 
-        ``scene_period`` is the time between two results: T, or n T of a slower scene.
+        ``scene_period`` is the time between two results: T, or n T of a slower scene. ``model`` and
+        ``data`` are replaced if the scene has delays, which keep their time; a weld is then lost.
 
         Raises:
             SceneError: The period is not finite and positive, or substeps is below 1.
@@ -230,11 +232,13 @@ class Scene:
             raise SceneError(f"period is {scene_period!r} s; it must be finite and > 0")
         if substeps < 1:
             raise SceneError(f"substeps is {substeps}; it must be 1 or more")
-        step = self.model.opt.timestep = scene_period / substeps
-        self._period = scene_period
+        before, step = self.model.opt.timestep, scene_period / substeps
+        self.model.opt.timestep, self._period = step, scene_period
         own = self._spec.option.timestep if self._spec else step
         words = f"timestep: {format_si(own, 's')} → {format_si(step, 's')}"
         self._announce(["time step"], [] if math.isclose(own, step) else [words])
+        if self._spec and self.model.nhistory and step != before:
+            self._recompile(self._spec)
 
     def _announce(self, subjects: Collection[str], words: Iterable[str | SceneChange]) -> None:
         """Replaces the changes on some subjects, of which words belong to the first.
@@ -366,6 +370,8 @@ class Scene:
         return trial
 
     def _recompile(self, spec: mujoco.MjSpec) -> None:
+        spec = spec.copy()
+        set_step(spec, self.model.opt.timestep)
         model = spec.compile()
         carry_over(self.model, model)
         self.model, self.data = model, mujoco.MjData(model)

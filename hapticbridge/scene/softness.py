@@ -42,8 +42,9 @@ def announce_rigid(model: mujoco.MjModel, options: Mapping[str, Any]) -> tuple[S
     """
     springs = tuple(_springs(model))
     changes = (*_softened(springs), *_bounces(springs), *_options(model.opt, options))
-    creeps = np.any(model.dof_frictionloss) or np.any(model.tendon_frictionloss)
-    if creeps and not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT:
+    is_flex = (model.eq_type > int(mujoco.mjtEq.mjEQ_TENDON)) & (model.eq_active0 != 0)
+    is_soft = any(map(np.any, (model.dof_frictionloss, model.tendon_frictionloss, is_flex)))
+    if is_soft and not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT:
         changes += (SceneChange("flag diagexact: disable → enable", "diagonal"),)
     return changes
 
@@ -56,7 +57,7 @@ def _springs(model: mujoco.MjModel) -> Iterator[_Springs]:
     rest was not strict (8.7 mJ, within slack).
     """
     obj, everywhere = mujoco.mjtObj, np.ones(model.npair, dtype=bool)
-    is_rigid = model.eq_type <= int(mujoco.mjtEq.mjEQ_TENDON)
+    is_rigid = (model.eq_type <= int(mujoco.mjtEq.mjEQ_TENDON)) & (model.eq_active0 != 0)
     touches = (model.geom_contype | model.geom_conaffinity) != 0
     flex_touches = (model.flex_contype | model.flex_conaffinity) != 0
     kinds: tuple[tuple[str, str, mujoco.mjtObj, str, NDArray[np.bool_]], ...] = (

@@ -222,6 +222,10 @@ _TAG = re.compile(r"[\w.:-]*")
 _NAMED_FROM_HOME = {"include", "model", "compiler"}
 
 
+REPLACED = "\ufffd"
+"""Character that ``read_elements`` yields for a byte that is not UTF-8."""
+
+
 def read_elements(data: bytes) -> Iterator[Element]:
     """Yields the elements of an XML file in order; other content is skipped."""
     text = data.decode("utf-8-sig", errors="replace")

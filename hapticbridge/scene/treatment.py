@@ -50,6 +50,10 @@ TREATMENTS: dict[str, Treatment] = {
         "option", "timestep", "changed", "the loop's period, in equal substeps",
         "each period of the device has its step",
     ),
+    "delays": Treatment(
+        "actuator, sensor", "", "changed", "as many samples (`nsample`) as span the same time",
+        "a delay keeps its time at another time step",
+    ),
     "integrator": Treatment(
         "option", "integrator", "changed", "the method's",
         "the energy of a step is only then known",
@@ -104,7 +108,8 @@ TREATMENTS: dict[str, Treatment] = {
         "flag", "energy", "changed", "enable", "the meter reads it; it moves nothing",
     ),
     "diagonal": Treatment(
-        "flag", "diagexact", "changed", "enable; dry friction creeps otherwise then",
+        "flag", "diagexact", "changed",
+        "enable; dry friction creeps and flexes yield otherwise then",
         "rigid contacts need the exact inertia of each row", is_rigid=True,
     ),
     "autoreset": Treatment(

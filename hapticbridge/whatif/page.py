@@ -54,6 +54,9 @@ def rows(what_if: WhatIf) -> Iterator[Row]:
                         for c in couplings
                     ),
                 )
+    weights = tuple(str(run.recording.meta.get("tool_weight", "unknown")) for run in runs)
+    if len(set(weights)) > 1:  # a device that cannot hold it makes the scene carry it
+        yield "weight of the tool", weights
     yield "verdict", tuple(f"{r.words}, tripped" if r.trip else r.words for r in reports)
     for name in runs[0].peaks:
         unit = unit_of(Limits, name.split()[0])
