@@ -139,7 +139,8 @@ class AuditReport:
     @property
     def words(self) -> str:
         """The verdict in a few words; see ``verdict_words``."""
-        return verdict_words(self.verdict, self.environment or "", self.port)
+        environment = "toward the hand" if self.credit else self.environment or ""
+        return verdict_words(self.verdict, environment, self.port)
 
     def to_json(self) -> str:
         """Returns the report as one JSON object; a number that is not finite becomes null."""

@@ -337,7 +337,8 @@ class Audit:
 
 def _print_report(report: AuditReport) -> None:
     colour = _VERDICT_COLOURS[report.verdict]
-    judged = "environment " if report.environment and not report.port else ""
+    is_judged = report.environment and not report.port and not report.credit
+    judged = "environment " if is_judged else ""
     tripped = ", [bold yellow]then the guard stopped the run[/]" if report.trip else ""
     out.print(f"{plain(str(report.path))}: {judged}[bold {colour}]{report.words}[/]{tripped}")
     out.print(f"  {plain(report.reason)}")

@@ -72,7 +72,7 @@ from hapticbridge.scene.compile import custom_text
 from hapticbridge.scene.first_faults import worst_faults
 from hapticbridge.scene.rehearsal import static_load
 from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
-from hapticbridge.units import format_si
+from hapticbridge.units import format_energy, format_si
 
 if TYPE_CHECKING:
     from hapticbridge.view import Window
@@ -105,7 +105,7 @@ def announce(setup: RunSetup, named: Mapping[str, float], *, is_method_chosen: b
     usual = default_method()
     if is_method_chosen and method.name != usual.name:
         err.print(f"  {method.name}: {escape(method.about)}")
-    elif method.name != usual.name and setup.scene.hand == 0:
+    elif method.name != usual.name and setup.scene.hand == 0 and not setup.credit:
         has_several = setup.scene.has_several_hands
         reason = unsuited_reason(usual, setup.substeps, has_several_hands=has_several)
         err.print(f"  {method.name}, because {usual.name} {reason}")
@@ -165,6 +165,12 @@ def _announce_own_rate(setup: RunSetup) -> None:
 
 def _announce_slow(setup: RunSetup) -> None:
     rate, scales = 1.0 / setup.scene_period, setup.workspace.scales
+    if setup.credit:
+        err.print(
+            f"  another program shows its tool, {rate:.4g} times per second or as it can; the hand "
+            f"gets at most what it put in plus {format_energy(setup.credit)}"
+        )
+        return
     err.print(
         f"  the scene steps at {rate:.4g} Hz beside the loop, and its tool is shown in between"
     )

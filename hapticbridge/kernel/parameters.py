@@ -218,18 +218,20 @@ def _positive(unit: str) -> dict[str, Rule]:
 
 
 class StepTimes:
-    """Times of a scene that is stepped behind a loop, for a class with these three fields.
+    """Times of a scene that is stepped behind a loop, for a class with these fields.
 
     Attributes:
         period: T in s.
         substeps: MuJoCo steps per tick, or between two results of a slower scene.
         scene_ticks: Ticks between two results of a slower scene; 0 if it steps in every tick.
+        credit: Energy in J that another program's scene may give; 0 for a scene of the bridge.
     """
 
     __slots__ = ()
     period: float
     substeps: int
     scene_ticks: int
+    credit: float
 
     @property
     def scene_period(self) -> float:
@@ -238,8 +240,8 @@ class StepTimes:
 
     @property
     def timestep(self) -> float:
-        """MuJoCo's h in s."""
-        return self.scene_period / self.substeps
+        """MuJoCo's h in s; T for a scene of another program, to which the law is the coupling."""
+        return (self.period if self.credit else self.scene_period) / self.substeps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -518,6 +518,11 @@ class RunSetup(StepTimes):
         return replace(setup, guard=guard)
 
     @property
+    def credit(self) -> float:  # type: ignore[override] # that of the scene
+        """Energy in J that another program's scene may give; 0 for a scene of the bridge."""
+        return self.scene.credit
+
+    @property
     def law(self) -> Coupling:
         """Coupling of the law: K and B', for which the device needs b >= s (K T/2 + B')."""
         return self.method.law_coupling(self.coupling, self.timestep)
@@ -648,7 +653,7 @@ class RunSetup(StepTimes):
             device_origin=IDENTITY_POSE if is_absolute else pose,
             handle_origin=IDENTITY_POSE if is_absolute else self.scene.grip_pose(),
             device_start=pose,
-            credit=self.scene.credit,
+            credit=self.credit,
             scheme=self.method.scheme,
             is_rigid=self.method.is_rigid,
             effective=effective,
