@@ -583,9 +583,12 @@ class RunSetup(StepTimes):
             unpowered = self._sent(holding_force(scene, parameters, has_motors=False))
             if (force := min(force, unpowered)) <= most:
                 return ""  # motors push; what they hold of the tool counts for it
+            left = float(np.linalg.norm(static_load(scene.with_tool_carried(), parameters)[:3]))
+            is_laden = 2.0 * left > parameters.guarding.idle_force - self.guard.idle_force
+            part = f"{self._sent(left):.3g} N of it at rest from what hangs or lies on the tool, "
             return (
-                f"it pulls with up to {force:.3g} N, its first swing included, and the device "
-                f"holds {most:.3g} N"
+                f"it pulls with up to {force:.3g} N, {part if is_laden else ''}its first swing "
+                f"included, and the device holds {most:.3g} N"
             )
         if (force := self._sent(toppling_force(scene, parameters))) > most:
             return (
