@@ -6,6 +6,7 @@ import errno
 import importlib
 import json
 import math
+import os
 import secrets
 import shlex
 import shutil
@@ -93,9 +94,31 @@ def read_json(text: str | bytes) -> Any:
 
 def reason_of(error: OSError, target: Path) -> str:
     """Returns the reason why a file or folder cannot be written, in words."""
-    if not target.absolute().parent.is_dir():
+    folder = target.absolute().parent
+    if not os.path.lexists(folder):
         return f"the folder {target.parent} does not exist"
+    if not os.path.isdir(folder):  # noqa: PTH112 - pathlib's raises without permission
+        return f"{target.parent} is not a folder"
+    if error.errno == errno.ENOENT:  # as in /proc
+        return f"the folder {target.parent} takes no new file"
     return error.strerror or str(error)
+
+
+def check_target(path: Path, error: type[HapticBridgeError]) -> None:
+    """Checks that a file can be made or replaced, before anything is computed for it.
+
+    An existing path that is no regular file, such as a pipe, is not tried.
+
+    Raises:
+        HapticBridgeError: ``error``, with the reason.
+    """
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder")
+        if path.is_file() or not path.exists():
+            tempfile.TemporaryFile(dir=path.resolve().parent).close()
+    except OSError as found:
+        raise error(f"cannot write '{path}': {reason_of(found, path)}") from None
 
 
 _LIMITS = {
@@ -168,6 +191,6 @@ def prepared_folder(folder: Path, names: Collection[str] = ()) -> Path:
     except FileExistsError:
         raise StudyError(f"'{folder}' is a file; name a folder to write into") from None
     except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
+        reason = reason_of(error, path) if isinstance(error, OSError) else str(error)
         raise StudyError(f"cannot write '{path}': {reason}") from None
     return folder

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.files import atomic_write
+from hapticbridge.files import atomic_write, check_target, reason_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,7 +28,7 @@ def check_ending(path: Path | None) -> None:
     None, for no picture, passes.
 
     Raises:
-        HapticBridgeError: The extension is not one of ``ENDINGS``, or the folder does not exist.
+        HapticBridgeError: The extension is not one of ``ENDINGS``, or no such file can be made.
     """
     if path is None:
         return
@@ -36,8 +36,7 @@ def check_ending(path: Path | None) -> None:
         raise HapticBridgeError(
             f"the picture '{path}' must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
         )
-    if not path.absolute().parent.is_dir():
-        raise HapticBridgeError(f"cannot write '{path}': its folder does not exist")
+    check_target(path, HapticBridgeError)
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -68,7 +67,7 @@ def write_picture(figure: Figure, path: Path) -> None:
         with atomic_write(path) as draft:
             _save(figure, draft, dpi=DOTS_PER_INCH)
     except OSError as error:
-        raise HapticBridgeError(f"cannot write '{path}': {error.strerror}") from None
+        raise HapticBridgeError(f"cannot write '{path}': {reason_of(error, path)}") from None
 
 
 def inline_svg(figure: Figure) -> str:

@@ -41,7 +41,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import StudyError, choices
-from hapticbridge.files import import_extra
+from hapticbridge.files import import_extra, reason_of
 from hapticbridge.signals import holding_interrupts
 
 # Points: checked mappings of parameters, their keys, and grids of them
@@ -237,7 +237,7 @@ class Table:
             else:
                 _write_parquet(columns, path, units or {})
         except OSError as error:
-            raise StudyError(f"{path}: cannot be written ({error.strerror})") from None
+            raise StudyError(f"cannot write '{path}': {reason_of(error, path)}") from None
 
 
 class Interrupted(KeyboardInterrupt):
@@ -322,7 +322,8 @@ class ResultFile:
                 elif self._lines and self._lines[-1]:
                     file.write(b"\n")  # ends a line that a crash has cut
         except OSError as error:
-            raise StudyError(f"{self.path}: cannot be written ({error.strerror})") from None
+            reason = reason_of(error, self.path)
+            raise StudyError(f"cannot write '{self.path}': {reason}") from None
         found = _parsed(first) if first else identity
         if found != identity:
             raise StudyError(
@@ -356,7 +357,8 @@ class ResultFile:
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            raise StudyError(f"{self.path}: cannot be written ({error.strerror})") from None
+            reason = reason_of(error, self.path)
+            raise StudyError(f"cannot write '{self.path}': {reason}") from None
 
 
 def _parsed(line: bytes) -> dict[str, Any]:

@@ -35,10 +35,12 @@ from hapticbridge.check.lean import MAY_GO
 from hapticbridge.check.run_faults import run_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS, Simplification
 from hapticbridge.check.version import SceneVariant, name_everything, witness
+from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import Motion
 from hapticbridge.errors import DeviceError, SceneError
+from hapticbridge.run.bridge import Bridge
 from hapticbridge.scene import compile_scene, read_scene, scene_names, scene_path
 from hapticbridge.scene.fault import Fault, length, weight
 from hapticbridge.scene.first_faults import worst_faults
@@ -636,3 +638,60 @@ def test_a_motor_that_pushes_with_its_own_velocity_is_a_pump(
     assert fault.place.line == 6
     assert "pushes" in fault.sentence and "harder the faster it moves" in fault.sentence
     assert not found("unused", bias=1.01 * limit, biastype="none")
+
+
+def test_a_tool_that_starts_in_a_height_field_is_told_to_start_outside(tmp_path: Path) -> None:
+    """The advice, followed, ends the finding."""
+    text = """<mujoco><option timestep="0.001" integrator="discrete" cone="elliptic"/><asset>
+    <hfield name="h" nrow="3" ncol="3" size="1 1 .02 .03" elevation="0 0 0 0 1 0 0 0 0"/></asset>
+    <worldbody><geom type="hfield" hfield="h"/><body pos="0 0 {}"><freejoint/>
+    <geom size=".02" mass="0.1"/><site name="grip"/></body></worldbody></mujoco>"""
+    inside = faults_in(tmp_path, text.format(0.02))
+    told = [fault for fault in inside if "start of" in fault.sentence]
+    assert [(fault.kind, "parts apart" in fault.change) for fault in told] == [("changed", True)]
+    outside = faults_in(tmp_path, text.format(0.06))
+    assert not any("start" in fault.sentence for fault in outside)
+
+
+def test_convex_pieces_open_the_hole_that_a_hull_fills(tmp_path: Path) -> None:
+    """A square tube; the peg enters it once the advice is followed, and not before."""
+
+    def corners(half: float) -> list[tuple[float, float, float]]:
+        around = ((-half, -half), (half, -half), (half, half), (-half, half))
+        return [(x, y, z) for z in (0.0, 0.05) for x, y in around]
+
+    faces = []
+    for i, j in ((0, 1), (1, 2), (2, 3), (3, 0)):
+        for a, b, c, d in (
+            (i, j, 4 + j, 4 + i),
+            (8 + j, 8 + i, 12 + i, 12 + j),
+            (4 + i, 4 + j, 12 + j, 12 + i),
+            (j, i, 8 + i, 8 + j),
+        ):
+            faces += [a, b, c, a, c, d]
+    vertices = " ".join(f"{v:g}" for point in corners(0.05) + corners(0.025) for v in point)
+    walls = [("0.0125 .05 .025", f"{x} 0 .025") for x in (0.0375, -0.0375)]
+    walls += [(".025 .0125 .025", f"0 {y} .025") for y in (0.0375, -0.0375)]
+    boxes = "".join(f'<geom type="box" size="{size}" pos="{pos}"/>' for size, pos in walls)
+    text = f"""<mujoco><option timestep="0.001"/><asset>
+    <mesh name="tube" vertex="{vertices}" face="{" ".join(map(str, faces))}"/></asset><worldbody>
+    <geom name="tube" type="mesh" mesh="tube" {{}}<body pos="0 0 .12"><freejoint/>
+    <geom type="box" size=".015 .015 .04" mass="0.1"/><site name="grip"/></body></worldbody>
+    </mujoco>"""
+    down = "t,x,y,z\n0,0,0,0\n2,0,0,-0.07\n"
+    fault = one_of("mesh not convex", faults_in(tmp_path, text.format("/>"), down))
+    open_to_air = 'contype="0" conaffinity="0"'
+    assert open_to_air in fault.change
+    scene, motion = tmp_path / "tube.xml", tmp_path / "down.csv"
+    motion.write_text(down)
+    depths = []
+    for words in ("/>", f"{open_to_air}/>{boxes}"):
+        scene.write_text(text.format(words))
+        device, clock = f"trajectory:{motion}", SimulatedClock()
+        with Bridge(scene, device, clock=clock, tool_weight=False) as bridge:
+            bridge.run()
+            depths.append(bridge.scene.grip_pose()[2])
+    assert depths[0] > 0.085
+    assert depths[1] < 0.055
+    mended = faults_in(tmp_path, text.format(f"{open_to_air}/>{boxes}"), down)
+    assert "mesh not convex" not in kinds(mended)

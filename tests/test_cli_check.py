@@ -174,8 +174,8 @@ def test_bad_input_is_refused_before_anything_is_run(
         ("--lean --budget nan", "budget"),
         (f"--write {studded[0]}", "is a file of the scene itself"),
         (f"--write {tmp_path}/lean.txt", "must end in .xml"),
-        (f"--write {tmp_path}/no/lean.xml", "its folder does not exist"),
-        (f"--plot {tmp_path}/no/check.png", "its folder does not exist"),
+        (f"--write {tmp_path}/no/lean.xml", f"the folder {tmp_path}/no does not exist"),
+        (f"--plot {tmp_path}/no/check.png", f"the folder {tmp_path}/no does not exist"),
     ):
         code, out, err = call("check", *studded, *extra.split())
         assert (code, out) == (2, "")

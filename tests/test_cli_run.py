@@ -197,8 +197,10 @@ def test_carrying_the_tool_is_advised_with_what_it_leaves_and_only_where_it_is_n
     options = ("--no-tool-weight",) if is_carried else ()
     _, _, err = call("run", scene, "--fast", "--duration", 0.05, *options)
     words = " ".join(err.split())
-    advice = "--no-tool-weight carries it (tried: the hand then bears 3.9"
-    assert (advice in words) != is_carried
+    advice = "--no-tool-weight carries the tool alone (tried: the hand then bears 3.9"
+    cause = "what hangs or lies on the tool weighs most of the 6.87 N"
+    assert (advice in words, cause in words) == (not is_carried, not is_carried)
+    assert "this tool weighs" not in words
     assert ("from what hangs or lies on the tool, whose weight is carried" in words) == is_carried
 
 
@@ -524,3 +526,29 @@ def test_a_duration_without_end_is_refused(call: Called, duration: str) -> None:
     code, _, err = call("run", "point_mass", "--fast", "--duration", duration)
     assert code == 2
     assert "at most 1e+09" in err
+
+
+def test_a_load_is_told_as_that_of_the_bodies_that_give_it(call: Called, tmp_path: Path) -> None:
+    """A brick of 1 kg falls on a tray of 0.1 kg, and a chain of 0.3 kg hangs from one."""
+    scene = tmp_path / "laden.xml"
+    laden = LADEN.format(0.06).replace('".4"', '"1"').replace('".3"', '"{}"')
+    of_brick = "N of it at rest from what hangs or lies on the tool"
+    for mass, is_of_brick in (("0.1", True), ("1.2", False)):
+        scene.write_text(laden.format(mass))
+        _, _, err = call("run", scene, "--fast", "--duration", 0.01)
+        words = " ".join(err.split())
+        assert "weight of the tool: felt → carried (it pulls with up to" in words
+        assert (of_brick in words) == is_of_brick
+    links = ""
+    for _ in range(3):
+        ball = '<joint type="ball"/><geom pos="0 0 -.05" size=".01" mass="0.1"/>'
+        links = f'<body pos="0 0 -.05">{ball}{links}</body>'
+    chain = """<mujoco><worldbody><body><freejoint/><site name="grip"/>
+    <geom size=".02" mass="0.1"/>{}</body></worldbody></mujoco>"""
+    for hanging, is_chain in ((links, True), ('<geom size=".03" mass="0.3"/>', False)):
+        scene.write_text(chain.format(hanging))
+        _, _, err = call("run", scene, "--fast", "--duration", 0.01)
+        words = " ".join(err.split())
+        assert "--no-tool-weight carries the tool alone (tried: the hand then bears 0 N)" in words
+        assert ("this tool with its links (" in words) == is_chain
+        assert ("this tool weighs" in words) != is_chain

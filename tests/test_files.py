@@ -11,7 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from hapticbridge.files import atomic_write, finite_or_null, install_command, read_json
+from hapticbridge.errors import RecordingError, StudyError
+from hapticbridge.files import (
+    atomic_write,
+    check_target,
+    finite_or_null,
+    install_command,
+    prepared_folder,
+    read_json,
+)
 
 
 @pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
@@ -111,3 +119,34 @@ def test_the_command_for_an_extra_fits_the_place_of_the_program(
     monkeypatch.setattr("hapticbridge.files.CHECKOUT", checkout)
     monkeypatch.chdir(checkout if is_here else elsewhere)
     assert install_command("view") == expected.format(checkout=checkout, python=sys.executable)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc is Linux's")
+@pytest.mark.parametrize(
+    ("folder", "reason"),
+    [
+        ("/proc", "the folder /proc takes no new file"),
+        ("/dev/full", "/dev/full is not a folder"),
+        ("{}/no", "the folder {}/no does not exist"),
+    ],
+)
+def test_why_a_file_cannot_be_made_is_true(tmp_path: Path, folder: str, reason: str) -> None:
+    path, words = Path(folder.format(tmp_path)) / "x.png", reason.format(tmp_path)
+    with pytest.raises(RecordingError, match=f"cannot write '{path}': {words}$"):
+        check_target(path, RecordingError)
+
+
+def test_a_folder_is_no_file_to_write_and_a_file_to_replace_stays(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"it is a folder$"):
+        check_target(tmp_path, RecordingError)
+    (tmp_path / "mine").write_text("mine")
+    for name in ("mine", "new"):
+        check_target(tmp_path / name, RecordingError)
+    assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [("mine", "mine")]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc is Linux's")
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+    with pytest.raises(StudyError, match=r"'/proc/x': the folder /proc takes no new file$"):
+        prepared_folder(Path("/proc/x"))
+    assert prepared_folder(tmp_path / "new" / "more").is_dir()

@@ -245,8 +245,11 @@ def test_hand_path_beside_a_scene_is_never_overwritten(
 
 def test_command_draws_a_chart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["chart", "point_mass", "--methods", "implicit", "lossless", "--steps", "4", "1"]
-    assert main([*arguments, "--quick", "--out", str(tmp_path)]) == 0
+    picture = tmp_path.with_name("picture.pdf")
+    arguments += ["--plot", str(picture), "--out", str(tmp_path)]
+    assert main([*arguments, "--quick"]) == 0
     printed = capsys.readouterr()
+    assert picture.read_bytes().startswith(b"%PDF")
     assert "for 1 kHz: " in printed.out and "default: lossless, 1 ms (" in printed.out
     assert re.search(
         r"on the front, by cost:\n +[0-9.e-]+ s per s, [0-9.e-]+ JND: \w+", printed.out

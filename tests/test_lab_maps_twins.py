@@ -105,9 +105,13 @@ def test_the_command_writes_the_twins_and_names_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["stability", "restitution", "--points", "4", "--out", str(tmp_path)]
+    picture = tmp_path / "mine.svg"
+    assert main(["stability", "all", "--plot", str(picture)]) == 2
+    assert "--plot is the picture of one map" in capsys.readouterr().err
     files = [f"restitution.{ending}" for ending in ENDINGS]
     (tmp_path / files[0]).write_text("old")
-    assert main(command) == 0
+    assert main([*command, "--plot", str(picture)]) == 0
+    assert "<svg" in picture.read_text(encoding="utf-8")
     printed = capsys.readouterr()
     sentence = json.loads((tmp_path / "restitution.json").read_text(encoding="utf-8"))["twins"][
         "sentence"

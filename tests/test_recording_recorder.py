@@ -134,6 +134,7 @@ def test_recorder_loads_neither_mujoco_nor_the_compiler(ring: Ring, tmp_path: Pa
 def test_what_cannot_be_recorded_is_refused_before_the_run(ring: Ring, tmp_path: Path) -> None:
     for path, reason in (
         (tmp_path / "none" / "run.mcap", "the folder .* does not exist"),
+        (Path("/proc/run.mcap"), "the folder /proc takes no new file"),
         (tmp_path, "Is a directory"),
         (Path("/dev/full"), "No space left on device"),
     ):

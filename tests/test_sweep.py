@@ -392,9 +392,9 @@ def test_axes_that_span_no_grid_are_refused() -> None:
 def test_a_file_that_cannot_be_used_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for path in (tmp_path, tmp_path / "file" / "below", Path("/proc/nowhere/kept")):
-        with pytest.raises(StudyError, match="cannot be written"):
+        with pytest.raises(StudyError, match="cannot write"):
             sweep(functions.bound, POINTS, results=path, workers=1)
-    with pytest.raises(StudyError, match="cannot be written"):
+    with pytest.raises(StudyError, match="cannot write"):
         serial().write(tmp_path / "no" / "where.csv")
     with pytest.raises(StudyError, match="the formats are 'csv', 'parquet'"):
         serial().write(tmp_path / "table.hdf5")

@@ -156,7 +156,7 @@ def test_a_saved_page_holds_the_whole_run(replay: Replay, call: Called, tmp_path
     [
         ("run.png", "must end in .html"),
         ("mine.html", "exists; choose another file or add --overwrite"),
-        ("no/such.html", "its folder does not exist"),
+        ("no/such.html", "no does not exist"),
     ],
 )
 def test_a_page_that_cannot_be_saved_is_refused_before_the_run_is_simulated(

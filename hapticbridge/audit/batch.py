@@ -15,7 +15,7 @@ import numpy as np
 from hapticbridge.audit import audit
 from hapticbridge.confinement import ForeignSceneError
 from hapticbridge.errors import RecordingError, StudyError, choices
-from hapticbridge.files import finite_or_null
+from hapticbridge.files import check_target, finite_or_null, reason_of
 from hapticbridge.sweep import Interrupted, Table, Value, Workers, check_format, sweep
 
 FEW = 8
@@ -155,8 +155,8 @@ def check_table_name(path: Path) -> None:
     """Checks that a table can be written to a file, before anything is computed for it.
 
     Raises:
-        StudyError: The extension is not .parquet, .csv or .json, pyarrow is missing, or the folder
-            does not exist.
+        StudyError: The extension is not .parquet, .csv or .json, pyarrow is missing, or no such
+            file can be made.
     """
     form = path.suffix.removeprefix(".")
     if form not in ("parquet", "csv", "json"):
@@ -164,8 +164,7 @@ def check_table_name(path: Path) -> None:
         raise StudyError(f"the table '{path}' must end in one of {endings}")
     if form != "json":
         check_format(form)
-    if not path.absolute().parent.is_dir():
-        raise StudyError(f"cannot write '{path}': its folder does not exist")
+    check_target(path, StudyError)
 
 
 def write_audits(table: Table, path: Path) -> None:
@@ -187,7 +186,7 @@ def write_audits(table: Table, path: Path) -> None:
     try:
         path.write_text(json.dumps(finite_or_null(rows), indent=1, allow_nan=False) + "\n", "utf-8")
     except OSError as error:
-        raise StudyError(f"{path}: cannot be written ({error.strerror})") from None
+        raise StudyError(f"cannot write '{path}': {reason_of(error, path)}") from None
 
 
 def worst_exit_code(table: Table) -> int:

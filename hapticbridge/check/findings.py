@@ -60,11 +60,16 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
                 "changed",
                 places.option("integrator"),
                 f"the scene runs with a change, {change}, because {change.treatment.why}",
-                _instead(change.treatment),
+                APART if change.subject == "start" else _instead(change.treatment),
             )
     for name, concern in unmetered_work(case.model).items():
         place = places.with_attribute(name) or places.option(name)
         yield Fault("unmetered work", place, concern + MAY_BE_ACTIVE, f"remove {name}")
+
+
+APART = "a start (pos, or keyframe 'home') with parts apart, limits kept and constraints closed"
+"""Change of a scene whose start a run moves. A tool in a height field may be moved far, out of its
+side or its base, and not to the place that was meant."""
 
 
 def _instead(treatment: Treatment) -> str:

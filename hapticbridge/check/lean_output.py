@@ -14,6 +14,7 @@ from hapticbridge.check.perception import FeltError
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.errors import SceneError
+from hapticbridge.files import check_target, reason_of
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.scene import SceneSource, read_scene
 from hapticbridge.scene.handle import set_step
@@ -72,19 +73,18 @@ def lean_facts(lean: Lean, written: VariantVerdict | None = None) -> dict[str, o
 ENDING = ".xml"
 
 
-def check_target(source: SceneSource, path: Path, *, overwrite: bool = False) -> None:
+def check_lean_target(source: SceneSource, path: Path, *, overwrite: bool = False) -> None:
     """Checks that a leaner scene can be written, before the search starts.
 
     Raises:
-        SceneError: The file's name does not end in .xml, its folder does not exist, it is a file of
-            the scene itself, or it exists and ``overwrite`` is False.
+        SceneError: The file's name does not end in .xml, it cannot be made, it is a file of the
+            scene itself, or it exists and ``overwrite`` is False.
     """
     if path.suffix.lower() != ENDING:
         raise SceneError(f"cannot write the scene to '{path}': its name must end in {ENDING}")
     if path.resolve() in {file.resolve() for file in _files(source)}:
         raise SceneError(f"'{path}' is a file of the scene itself; choose another name")
-    if not path.absolute().parent.is_dir():
-        raise SceneError(f"cannot write the scene to '{path}': its folder does not exist")
+    check_target(path, SceneError)
     if path.exists() and not overwrite:
         raise SceneError(f"'{path}' exists; choose another file or add --overwrite")
 
@@ -103,7 +103,7 @@ def write_lean(lean: Lean, path: Path, *, overwrite: bool = False) -> VariantVer
         SceneError: No simplification passed, or the file cannot be written or read back.
     """
     judge, source = lean.judge, lean.draft.source
-    check_target(source, path, overwrite=overwrite)
+    check_lean_target(source, path, overwrite=overwrite)
     if not lean.together:
         raise SceneError("no simplification may be made, so there is no leaner scene to write")
     spec = source.spec.copy()
@@ -114,7 +114,8 @@ def write_lean(lean: Lean, path: Path, *, overwrite: bool = False) -> VariantVer
     try:
         path.write_text(spec.to_xml(), encoding="utf-8")
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        words = " ".join(str(error).split())
+        reason = reason_of(error, path) if isinstance(error, OSError) else words
         raise SceneError(f"cannot write the scene to '{path}': {reason}") from None
     written = SceneVariant(read_scene(path), lean.draft.grip, setting)
     with quiet():

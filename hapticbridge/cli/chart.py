@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Literal
 
 from hapticbridge.arguments import option
-from hapticbridge.cli.terminal import err, out, plain, print_json, progress
+from hapticbridge.cli.terminal import err, out, plain, print_json, progress, write_figure
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.lab.chart.chart import MIN_REPEATS, REPEATS, Extent, measure_chart, open_workload
 from hapticbridge.lab.chart.engine_run import peer_settings
-from hapticbridge.lab.chart.output import ChartFiles, prepared_files, write_chart
+from hapticbridge.lab.chart.output import ChartFiles, draw_chart, prepared_files, write_chart
 from hapticbridge.lab.chart.scene_run import SceneRates
 from hapticbridge.lab.chart.setting import (
     Setting,
@@ -24,6 +24,7 @@ from hapticbridge.lab.chart.setting import (
 from hapticbridge.lab.chart.workload import Workload
 from hapticbridge.lab.engines.base import available_engines, caught_prints, open_engine
 from hapticbridge.lab.maps import MAPS, MapFiles, StabilityMap, run_map
+from hapticbridge.plotting import check_ending
 
 ALL = "all"
 
@@ -53,6 +54,8 @@ class Chart:
     """Other engines on the same work (extra 'peers'), or 'all' that are installed."""
     out: Path = Path("chart")
     """Folder to write to."""
+    plot: Path | None = None
+    """Draw the chart into this picture (.png, .svg or .pdf) too."""
     quick: bool = False
     """Three time steps and three rounds of timing: about a minute."""
     scene_rates: bool = False
@@ -62,6 +65,7 @@ class Chart:
 
     def execute(self) -> int:
         """Measures the chart; returns the exit code."""
+        check_ending(self.plot)
         is_rates = self.scene_rates or self.scene == SLOW_SCENE
         if is_rates and (self.methods is not None or self.steps is not None or self.engines):
             name = "--scene-rates" if self.scene_rates else f"'{self.scene}'"
@@ -82,6 +86,8 @@ class Chart:
             print_json(files.facts)
         else:
             _print(files)
+        if self.plot is not None:
+            write_figure(draw_chart(chart), self.plot)
         return 0
 
     def _usual(self) -> tuple[Workload, list[Setting], list[float]]:
@@ -153,6 +159,8 @@ class Stability:
     restitution."""
     out: Path = Path("stability")
     """Folder to write to."""
+    plot: Path | None = None
+    """Draw the map into this picture (.png, .svg or .pdf; one map only) too."""
     points: int | None = None
     """About how many runs or points; by default the map's own number, for about a minute."""
     form: Literal["csv", "parquet"] = option("csv", flag="format")
@@ -169,6 +177,9 @@ class Stability:
             raise StudyError(
                 f"no map is called '{self.name}'; maps: {choices([*MAPS, ALL])} ({listed})"
             )
+        check_ending(self.plot)
+        if self.plot is not None and self.name == ALL:
+            raise StudyError("--plot is the picture of one map; name it in place of 'all'")
         chosen = MAPS.values() if self.name == ALL else (MAPS[self.name],)
         facts = []
         for each in chosen:
@@ -176,6 +187,8 @@ class Stability:
             facts.append(json.loads(files.boundary.read_text(encoding="utf-8")))
             if not self.as_json:
                 _print_map(each, files)
+            if self.plot is not None:
+                write_figure(files.finding.figure, self.plot)
         if self.as_json:
             print_json(facts)
         return 0

@@ -33,7 +33,7 @@ from hapticbridge.check.lean import (
     checked_budget,
     find_lean,
 )
-from hapticbridge.check.lean_output import check_target, lean_facts, write_lean
+from hapticbridge.check.lean_output import check_lean_target, lean_facts, write_lean
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress, working
@@ -357,7 +357,7 @@ class Check:
             source = read_scene(self.scene, **settings_from(self.settings))
             plain_model(source)
         if self.write is not None:
-            check_target(source, self.write, overwrite=self.overwrite)
+            check_lean_target(source, self.write, overwrite=self.overwrite)
         period = None if self.rate is None else period_of(self.rate)
         with progress("leading it through its motion") as show:
             case = open_case(

@@ -23,6 +23,7 @@ from hapticbridge.device import AXES, DeviceInfo, open_device
 from hapticbridge.device.base import checked_close
 from hapticbridge.device.profile import Profile, own_folder
 from hapticbridge.errors import HapticBridgeError, choices
+from hapticbridge.files import reason_of
 from hapticbridge.identify import Identification, identify
 from hapticbridge.identify.fit import CONFIDENCE
 from hapticbridge.identify.identify import (
@@ -330,5 +331,5 @@ def _write(profile: Profile, path: Path) -> str:
             former = str(path.replace(path.with_name(f"{path.name}.old")))
         path.write_text(profile.to_toml(), encoding="utf-8")
     except OSError as error:
-        raise HapticBridgeError(f"cannot write '{path}': {error.strerror}") from None
+        raise HapticBridgeError(f"cannot write '{path}': {reason_of(error, path)}") from None
     return former

@@ -12,7 +12,7 @@ from typing import Literal
 from hapticbridge.arguments import option, shared
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress
 from hapticbridge.errors import RecordingError
-from hapticbridge.files import atomic_write
+from hapticbridge.files import atomic_write, check_target
 from hapticbridge.recording import read_recording
 from hapticbridge.replay.film import USUAL_SHOT, Shot, draw
 from hapticbridge.tools.compare import Comparison, Difference, compare
@@ -76,8 +76,7 @@ class View:
             raise RecordingError(f"--save is '{path}'; the page must end in .html")
         if path.exists() and not self.overwrite:
             raise RecordingError(f"'{path}' exists; choose another file or add --overwrite")
-        if not path.absolute().parent.is_dir():
-            raise RecordingError(f"'{path}' cannot be written: its folder does not exist")
+        check_target(path, RecordingError)
 
 
 @dataclass(frozen=True, slots=True)

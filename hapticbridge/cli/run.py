@@ -69,7 +69,9 @@ from hapticbridge.scene import (
     settings_from,
 )
 from hapticbridge.scene.compile import custom_text
+from hapticbridge.scene.fault import weight
 from hapticbridge.scene.first_faults import worst_faults
+from hapticbridge.scene.physics import tool_masses
 from hapticbridge.scene.rehearsal import static_load
 from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
 from hapticbridge.units import format_energy, format_si
@@ -273,10 +275,20 @@ def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]
         )
     else:
         carried = static_load(setup.scene.with_tool_carried(), parameters)[:3]
-        left = format_si(scale * float(np.linalg.norm(carried)), "N")
+        left = float(np.linalg.norm(carried))
+        own, whole = tool_masses(setup.scene.model, setup.scene.grip)
+        subject = "this tool"
+        if own < 0.5 * whole:
+            subject += f" with its links ({weight(whole)}, without them {weight(own)})"
+        cause = f"{subject} weighs {format_si(in_hand, 'N')} in the hand, which holds it {sag}"
+        if 2.0 * left > load:
+            cause = (
+                f"what hangs or lies on the tool weighs most of the {format_si(in_hand, 'N')} that "
+                f"the hand bears {sag}"
+            )
         yield (
-            f"this tool weighs {format_si(in_hand, 'N')} in the hand, which holds it {sag} beside "
-            f"the handle; --no-tool-weight carries it (tried: the hand then bears {left})"
+            f"{cause} beside the handle; --no-tool-weight carries the tool alone (tried: the hand "
+            f"then bears {format_si(scale * left, 'N')})"
         )
 
 

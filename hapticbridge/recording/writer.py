@@ -22,6 +22,7 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.files import reason_of
 from hapticbridge.kernel.record import FORMAT, TICK_DTYPE
 from hapticbridge.recording import format as layout
 from hapticbridge.recording import ros_messages
@@ -433,9 +434,7 @@ class RecordingWriter:
         self._index.close()
 
     def _refusal(self, error: OSError) -> RecordingError:
-        reason = error.strerror or str(error)
-        if error.errno == errno.ENOENT:
-            reason = f"the folder {self.path.parent} does not exist"
+        reason = reason_of(error, self.path)
         return RecordingError(f"cannot write the recording {self.path}: {reason}")
 
 

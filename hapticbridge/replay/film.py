@@ -26,7 +26,7 @@ from hapticbridge.arguments import check_fields, option
 from hapticbridge.audit.recorded_scene import load_machine_code, machine_code_for, seconds_for
 from hapticbridge.confinement import MEMORY, Confined, ForeignSceneError, Fresh, Work, Worker
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.files import install_command
+from hapticbridge.files import check_target, install_command, reason_of
 from hapticbridge.kernel import jit
 from hapticbridge.kernel.codes import added_actuators
 from hapticbridge.kernel.record import TICK_DTYPE, Timeline
@@ -156,7 +156,7 @@ def draw(
                 raise RecordingError(f"cannot write '{target}': {reason}")
             drawn.replace(target)
     except OSError as error:
-        raise RecordingError(f"cannot write '{target}': {error.strerror or error}") from None
+        raise RecordingError(f"cannot write '{target}': {reason_of(error, target)}") from None
     return renderer
 
 
@@ -231,8 +231,7 @@ def _check_target(target: Path, shot: Shot) -> None:
         raise HapticBridgeError(
             f"'{target}' is neither a picture nor a film; endings: {', '.join(ENDINGS)}"
         )
-    if not target.absolute().parent.is_dir():
-        raise HapticBridgeError(f"cannot write '{target}': its folder does not exist")
+    check_target(target, HapticBridgeError)
     if target.exists() and not target.is_file():
         raise HapticBridgeError(f"cannot write '{target}': it exists and is not a file")
     if ending == ".mp4" and shot.at is not None:

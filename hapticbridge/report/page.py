@@ -16,7 +16,7 @@ from hapticbridge.audit import AuditReport
 from hapticbridge.demand.guard import CONTROLLERS
 from hapticbridge.device import DATA_SHEET_UNITS
 from hapticbridge.errors import RecordingError
-from hapticbridge.files import atomic_write, read_json
+from hapticbridge.files import atomic_write, check_target, read_json, reason_of
 from hapticbridge.kernel.record import TickFlag, due_times
 from hapticbridge.plotting import inline_svg
 from hapticbridge.recording import Recording
@@ -283,12 +283,11 @@ def check_page_name(path: Path) -> None:
     """Checks that a page can be written under a name, before anything is computed for it.
 
     Raises:
-        RecordingError: The extension is not one of ``PAGES``, or the folder does not exist.
+        RecordingError: The extension is not one of ``PAGES``, or no such file can be made.
     """
     if path.suffix.lower() not in PAGES:
         raise RecordingError(f"the page '{path}' must end in {' or '.join(PAGES)}")
-    if not path.absolute().parent.is_dir():
-        raise RecordingError(f"cannot write '{path}': its folder does not exist")
+    check_target(path, RecordingError)
 
 
 def write_page(path: Path, template: str, **variables: object) -> None:
@@ -311,7 +310,7 @@ def write_page(path: Path, template: str, **variables: object) -> None:
         with atomic_write(path) as draft:
             draft.write_text(page, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
-        raise RecordingError(f"cannot write '{path}': {error.strerror}") from None
+        raise RecordingError(f"cannot write '{path}': {reason_of(error, path)}") from None
 
 
 # First sentences of a page

@@ -590,9 +590,15 @@ class RunSetup(StepTimes):
             unpowered = self._sent(holding_force(scene, parameters, has_motors=False))
             if (force := min(force, unpowered)) <= most:
                 return ""  # motors push; what they hold of the tool counts for it
+            left = float(np.linalg.norm(static_load(scene.with_tool_carried(), parameters)[:3]))
+            is_laden = 2.0 * left > parameters.guarding.idle_force - self.guard.idle_force
+            part = (
+                f"{format_si(self._sent(left), 'N')} of it at rest from what hangs or lies on it, "
+            )
             return (
                 f"within {format_si(HOLDING_STEPS * parameters.timestep, 's')} it pulls with up to "
-                f"{format_si(force, 'N')}, and the device holds {most:.3g} N"
+                f"{format_si(force, 'N')}, {part if is_laden else ''}and the device holds "
+                f"{most:.3g} N"
             )
         if (force := self._sent(toppling_force(scene, parameters))) > most:
             return (

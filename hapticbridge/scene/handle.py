@@ -317,7 +317,7 @@ def set_options(spec: mujoco.MjSpec, *, as_is: bool = False) -> tuple[SceneChang
         needed.append(SceneChange(f"noslip_iterations: {option.noslip_iterations} → 0", "noslip"))
     if option.enableflags & enable.mjENBL_SLEEP:
         needed.append(SceneChange("flag sleep: enable → disable", "sleep"))
-    needed += _constrain_edges(spec, as_is=as_is)
+    needed += _constrain_flexes(spec, as_is=as_is)
     if needed and as_is:
         raise SceneError(
             f"the scene needs other options to be coupled ({', '.join(map(str, needed))}); "
@@ -345,8 +345,11 @@ def set_options(spec: mujoco.MjSpec, *, as_is: bool = False) -> tuple[SceneChang
     return tuple(dict.fromkeys((*changes, *needed)))
 
 
-def _constrain_edges(spec: mujoco.MjSpec, *, as_is: bool) -> list[SceneChange]:
-    """Replaces springs and dampers on a flex's edges, which ``discrete`` lacks, by constraints.
+def _constrain_flexes(spec: mujoco.MjSpec, *, as_is: bool) -> list[SceneChange]:
+    """Replaces passive forces of a flex by constraints: of its edges, and of its contacts.
+
+    The integrator ``discrete`` lacks springs and dampers on edges, and no account has the energy of
+    passive contacts.
 
     Returns:
         The changes, as ``name: old → new``, which are not made if ``as_is`` forbids them.
@@ -354,19 +357,20 @@ def _constrain_edges(spec: mujoco.MjSpec, *, as_is: bool) -> list[SceneChange]:
     constrained = {each.name1 for each in spec.equalities if each.type == mujoco.mjtEq.mjEQ_FLEX}
     changes = []
     for flex in spec.flexes:
-        if flex.edgestiffness > 0:
-            words = "springs → constraints of constant length"
-        elif flex.edgedamping > 0:
+        if flex.passive:
+            words = f"contacts of flex '{flex.name}': passive → constraints"
+            changes.append(SceneChange(words, "passive contacts"))
+        if flex.edgestiffness > 0 or flex.edgedamping > 0:
             words = f"damping {flex.edgedamping:g} → 0"
-        else:
-            continue
-        changes.append(SceneChange(f"edges of flex '{flex.name}': {words}", "edges"))
+            if flex.edgestiffness > 0:
+                words = "springs → constraints of constant length"
+            changes.append(SceneChange(f"edges of flex '{flex.name}': {words}", "edges"))
         if as_is:
             continue
         if flex.edgestiffness > 0 and flex.name not in constrained:
             equality = spec.add_equality(name1=flex.name)
             equality.type, equality.active = mujoco.mjtEq.mjEQ_FLEX, True
-        flex.edgestiffness = flex.edgedamping = 0.0
+        flex.edgestiffness = flex.edgedamping = flex.passive = 0
     return changes
 
 

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticbridge.kernel.codes import held_body
 from hapticbridge.scene.contacts import impedance_at
 
 # Poses and rotations as NumPy arrays, by MuJoCo's functions
@@ -91,6 +92,14 @@ def body_inertia(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> float
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
     return _inertia_along(model, data, jacobian)
+
+
+def tool_masses(model: mujoco.MjModel, grip: str) -> tuple[float, float]:
+    """Returns the mass in kg of a grip's rigid body, and of all that moves with it on joints."""
+    body = held_body(model, grip)
+    parts = (values == values[body] for values in (model.body_weldid, model.body_treeid))
+    own, whole = (float(model.body_mass[part].sum()) for part in parts)
+    return own, whole
 
 
 def site_inertia(model: mujoco.MjModel, data: mujoco.MjData, site: int) -> float:

@@ -55,7 +55,7 @@ TREATMENTS: dict[str, Treatment] = {
         "a delay keeps its time at another time step",
     ),
     "integrator": Treatment(
-        "option", "integrator", "changed", "the method's",
+        "option", "integrator", "changed", "the method's, for ranges of lengths too",
         "the energy of a step is only then known",
     ),
     "eulerdamp": Treatment(
@@ -167,6 +167,10 @@ TREATMENTS: dict[str, Treatment] = {
     "edges": Treatment(
         "edge", "stiffness, damping", "changed", "constraints of constant length; no damping",
         "the implicit integrator lacks them", stops=True,
+    ),
+    "passive contacts": Treatment(
+        "flexcomp/contact, flex/contact", "passive", "changed", "constraints",
+        "the energy of passive contacts is in no account", stops=True,
     ),
     "mocap weld": Treatment(
         "connect, weld", "active", "changed", "false where a mocap body holds the grip",

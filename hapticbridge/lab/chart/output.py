@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from hapticbridge.errors import StudyError
-from hapticbridge.files import finite_or_null, prepared_folder
+from hapticbridge.files import finite_or_null, prepared_folder, reason_of
 from hapticbridge.lab.chart.chart import Chart, Measurement, Order
 from hapticbridge.lab.chart.setting import OWN, Setting, simulator_name
 from hapticbridge.lab.chart.workload import PASSIVE, Panel, Verdict
@@ -490,7 +490,8 @@ def write_chart(chart: Chart, paths: Mapping[str, Path]) -> ChartFiles:
         try:
             paths[ending].write_text(text, encoding="utf-8", newline="")
         except OSError as error:
-            raise StudyError(f"cannot write '{paths[ending]}': {error.strerror}") from None
+            reason = reason_of(error, paths[ending])
+            raise StudyError(f"cannot write '{paths[ending]}': {reason}") from None
     figure = draw_chart(chart)
     for ending in PICTURES:
         write_picture(figure, paths[ending])

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.device import Hand, Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.files import finite_or_null, prepared_folder
+from hapticbridge.files import finite_or_null, prepared_folder, reason_of
 from hapticbridge.lab.closed_loop import ClosedLoop
 from hapticbridge.lab.maps.twins import ENDINGS, RecordedTwins, Twins
 from hapticbridge.lab.methods import METHODS
@@ -210,7 +210,8 @@ def run_map(
     try:
         files["json"].write_text(text + "\n", encoding="utf-8")
     except OSError as error:
-        raise StudyError(f"cannot write '{files['json']}': {error.strerror}") from None
+        reason = reason_of(error, files["json"])
+        raise StudyError(f"cannot write '{files['json']}': {reason}") from None
     return MapFiles(files["png"], files[form], files["json"], finding, twins, failed)
 
 

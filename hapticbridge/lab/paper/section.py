@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.files import reason_of
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
 
 Relation = Literal["equals", "at most", "at least"]
@@ -193,5 +194,5 @@ def write_walk(sections: Sequence[Section], folder: Path) -> Path:
     try:
         path.write_text(page, encoding="utf-8")
     except OSError as error:
-        raise HapticBridgeError(f"cannot write '{path}': {error.strerror}") from None
+        raise HapticBridgeError(f"cannot write '{path}': {reason_of(error, path)}") from None
     return path
