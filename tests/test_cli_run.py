@@ -537,7 +537,7 @@ def test_a_load_is_told_as_that_of_the_bodies_that_give_it(call: Called, tmp_pat
         scene.write_text(laden.format(mass))
         _, _, err = call("run", scene, "--fast", "--duration", 0.01)
         words = " ".join(err.split())
-        assert "weight of the tool: felt → carried (it pulls with up to" in words
+        assert "weight of the tool: felt → carried (within 1 s it pulls with up to" in words
         assert (of_brick in words) == is_of_brick
     links = ""
     for _ in range(3):

@@ -437,7 +437,9 @@ def path_of(element: str) -> str:
 def subjects(element: str, words: str, contact: str) -> set[str]:
     """Returns subjects of the table by which attributes of an element may differ in a run."""
     path, names = f"/mujoco/{path_of(element)}", re.findall(r'(\w+)="', words)
-    return {
+    # those of each actuator and sensor, in one line of the table
+    delays = {"delays"} if "nsample" in names else set()
+    return delays | {
         subject
         for subject, each in TREATMENTS.items()
         if (contact == "rigid" or not each.is_rigid) and each.act != "kept, and said"

@@ -592,9 +592,8 @@ class RunSetup(StepTimes):
                 return ""  # motors push; what they hold of the tool counts for it
             left = float(np.linalg.norm(static_load(scene.with_tool_carried(), parameters)[:3]))
             is_laden = 2.0 * left > parameters.guarding.idle_force - self.guard.idle_force
-            part = (
-                f"{format_si(self._sent(left), 'N')} of it at rest from what hangs or lies on it, "
-            )
+            at_rest = format_si(self._sent(left), "N")
+            part = f"{at_rest} of it at rest from what hangs or lies on the tool, "
             return (
                 f"within {format_si(HOLDING_STEPS * parameters.timestep, 's')} it pulls with up to "
                 f"{format_si(force, 'N')}, {part if is_laden else ''}and the device holds "
