@@ -341,6 +341,7 @@ SUMS = ("name", "stat.", "nbuffer", "nJ", "nmocap", "nnames", "npaths", "narena"
 """Beginnings of the names of values that MuJoCo sums up over the whole model."""
 
 IN_TABLE_ALONE = {
+    "delays",  # their time stays as it was
     "energy",
     "actuation",
     "autoreset",
