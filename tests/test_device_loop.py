@@ -150,6 +150,31 @@ def test_a_loop_that_dies_is_lost_and_not_waited_for() -> None:
                 time.sleep(0.01)
 
 
+def test_a_loop_ends_with_the_program_that_was_killed(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    script = f"""
+import hapticbridge, time
+with hapticbridge.DeviceLoop("simulated", recording={str(path)!r}) as device:
+    device.show([0.0, 0.0, 0.1])
+    time.sleep(0.5)
+    print("shown", flush=True)
+    time.sleep(60.0)
+"""
+    program = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert program.stdout is not None
+    assert program.stdout.readline() == "shown\n"
+    program.kill()
+    program.communicate()
+    end = time.monotonic() + 30.0
+    while time.monotonic() < end:
+        recording = read_recording(path)
+        if not recording.is_cut:
+            break
+        time.sleep(0.2)
+    assert recording.events[-1]["event"] == "stop"
+    assert recording.events[-1]["reason"] == "program"
+
+
 # Frames
 
 

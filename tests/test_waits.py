@@ -48,6 +48,7 @@ REASONS = {
     "run/endpoint.py: self._thread.join()": "it looks for the end every REPORT_PERIOD",
     "run/endpoint.py: time.sleep(LAST_WORDS / 10)": "until LAST_WORDS is over",
     "program/device_loop.py: time.sleep(REPEAT)": DAEMON,
+    "cli/serve.py: time.sleep(LOOK)": DAEMON,
     "program/loop_process.py: for line in stream": DAEMON,
     "program/loop_process.py: told.read()": "the process has ended",
     # devices and their guardian

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 import secrets
+import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Thread
 from typing import ClassVar
 
 from hapticbridge.arguments import option
@@ -23,6 +25,16 @@ from hapticbridge.run.endpoint import CREDIT, Endpoint, GrantedClock, posted_sce
 from hapticbridge.run.options import DEFAULT_OPTIONS, BridgeOptions
 from hapticbridge.run.programs import prepare_run, words
 from hapticbridge.signals import interrupting_on_signals
+
+LOOK = 0.5
+"""Time in s between two looks whether the program that started the loop still lives."""
+
+
+def _watch_parent(parent: int, leave: Callable[[], None]) -> None:
+    """Ends the loop when the process that started it is gone."""
+    while os.getppid() == parent:
+        time.sleep(LOOK)
+    leave()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,6 +107,9 @@ class Serve:
                 stack.enter_context(bridge)
             interrupts.hand_over(bridge.stop_on_signal)
             endpoint.open(bridge)
+            if self.as_json:
+                leave = self._on_leave(bridge, clock)
+                Thread(target=_watch_parent, args=(os.getppid(), leave), daemon=True).start()
             self._tell(endpoint, token)
             error: BaseException | None = None
             try:

@@ -145,6 +145,7 @@ class DeviceLoop:
         self._call["version"], self._call["sequence"] = VERSION, time.time_ns()
         self._state: np.void = np.zeros(1, STATE_DTYPE)[0]
         self._has_state, self._has_shown = threading.Event(), False
+        self._socket: socket.socket | None = None
         self._heard = 0.0
         self._applied, self._shown = np.zeros(6), np.zeros(7)
         self._is_closed, self._placed = False, 0
@@ -152,11 +153,12 @@ class DeviceLoop:
 
     def __enter__(self) -> Self:
         address = self._remote or (self._process.start() if self._process else ("", 0))
-        self._socket = socket.socket(
-            socket.AF_INET6 if ":" in address[0] else socket.AF_INET, socket.SOCK_DGRAM
+        family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+        self._socket = channel = socket.socket(family, socket.SOCK_DGRAM)
+        channel.connect(address)
+        self._listener = threading.Thread(
+            target=self._listen, args=(channel,), name="device loop", daemon=True
         )
-        self._socket.connect(address)
-        self._listener = threading.Thread(target=self._listen, name="device loop", daemon=True)
         self._listener.start()
         end = time.monotonic() + ANSWER_TIME
         while not self._has_state.wait(REPEAT):
@@ -231,6 +233,8 @@ class DeviceLoop:
         with self._lock:
             post["work"] = self._call["post"]["work"]
             self._shown = post["pose"][0].copy()
+            if is_placed:  # no wrench has brought it there
+                self._applied = np.zeros(6)
             self._call["post"] = post
             is_first, self._has_shown = not self._has_shown, True
             self._send_pose(is_placed=is_placed or is_first)
@@ -324,8 +328,8 @@ class DeviceLoop:
         if self._is_closed:
             return
         self._is_closed = True
-        if hasattr(self, "_socket"):
-            with self._lock, suppress(OSError):
+        if self._socket is not None:
+            with self._lock:
                 self._send(Call.LEAVE)
             self._listener.join(1.0)
             self._socket.close()
@@ -377,13 +381,14 @@ class DeviceLoop:
         self._transmit()
 
     def _transmit(self) -> None:
-        with suppress(OSError):  # a network that is away may come back
-            self._socket.send(packed(self._call, self._token))
+        if self._socket is not None:
+            with suppress(OSError):  # a network that is away may come back
+                self._socket.send(packed(self._call, self._token))
 
-    def _listen(self) -> None:
+    def _listen(self, channel: socket.socket) -> None:
         while not self._is_closed:
             try:
-                data = self._socket.recv(4096)
+                data = channel.recv(4096)
             except ConnectionError:  # no loop is at that port yet
                 time.sleep(REPEAT)
                 continue
