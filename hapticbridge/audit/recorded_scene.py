@@ -121,7 +121,7 @@ def load_machine_code(name: str, contact: str, kind: str = "") -> None:
         sample["quaternion"][:, 0] = 1.0
         jit.direct(stretch_at, kernel.state[0], sample)  # of a run with absolute poses
         if kind:
-            slow: SlowScene | PostedScene = PostedScene(kernel, parameters)
+            slow: SlowScene | PostedScene = PostedScene(kernel, scene.data, parameters)
             if kind == "slow":
                 slow = SlowScene(kernel, scene.model, scene.data, parameters)
             slow.simulate(sample, flags, nothing, flags, rows)

@@ -166,7 +166,7 @@ class Resimulator:
         self.binding = self.hands.hands[0] if self.hands else BoundKernel(model, data, parameters)
         self._slow: SlowScene | PostedScene | None = None
         if parameters.credit > 0.0:
-            self._slow = PostedScene(self.binding, parameters, posts_in(events))
+            self._slow = PostedScene(self.binding, data, parameters, posts_in(events))
         elif parameters.scene_ticks:
             self._slow = SlowScene(self.binding, model, data, parameters)
         hands = tuple(zip((self.hands or self.binding).hands, every, strict=True))

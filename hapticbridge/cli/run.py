@@ -292,6 +292,33 @@ def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]
         )
 
 
+def is_mouse(device: str) -> bool:
+    """Returns True for the device that moves in the page of a view."""
+    return device.partition(":")[0] == "mouse"
+
+
+def open_window(port: int | None) -> Window:
+    """Returns the page of a view, at the usual port by None."""
+    from hapticbridge.view import Address, Window  # noqa: PLC0415 - for --view alone
+
+    return Window(Address() if port is None else Address(port))
+
+
+def attach_window(window: Window | None, bridge: Bridge, device: object) -> None:
+    """Lets a page, if there is one, give commands, and move the mouse."""
+    if window is not None:
+        window.on_command = partial(bridge.command, by="view")
+        if isinstance(device, MouseDevice):
+            window.on_hand = device.aim
+
+
+def announce_window(window: Window | None, device: object) -> None:
+    """Prints the address of a page, if there is one."""
+    if window is not None:
+        steer = "drag the arrows at the tool, and " if isinstance(device, MouseDevice) else ""
+        notify(f"view: {window.url} (open it in a browser; {steer}Ctrl-C ends the run)")
+
+
 def refuse_overwriting(record: Path | None, *devices: str, overwrite: bool) -> None:
     """Refuses a file that was not to be replaced, no recording, or the motion of the run.
 
@@ -387,7 +414,7 @@ class Run:
         refuse_simulated_time(self.device, clock)  # before the user is asked to home it
         if self.port is not None and not self._is_viewed:
             raise HapticBridgeError("--port without --view has no effect")
-        window = self._window() if self._is_viewed else None
+        window = open_window(self.port) if self._is_viewed else None
         with ExitStack() as stack:
             interrupts = stack.enter_context(interrupting_on_signals())
             with working("reading the scene"):
@@ -427,7 +454,7 @@ class Run:
     @property
     def _is_viewed(self) -> bool:
         """True if a page shows the run, with its state; plain lines would repeat it every 2 s."""
-        return self.view or self.device.partition(":")[0] == "mouse"
+        return self.view or is_mouse(self.device)
 
     def _warn_of_faults(self, source: SceneSource, scene: Scene) -> None:
         """Prints the worst faults of the scene, and keeps them for the recording."""
@@ -522,7 +549,7 @@ class Run:
         """Runs several hands, each with its grip, grip axis and device; returns the exit code."""
         for _, _, device in held:
             refuse_simulated_time(device, clock)
-            if device.partition(":")[0] == "mouse":
+            if is_mouse(device):
                 raise HapticBridgeError("the mouse is for one hand: --device mouse")
         if self.grip_axis not in (None, "none"):
             raise HapticBridgeError(
@@ -605,19 +632,14 @@ class Run:
         bridge = Bridge(
             scene, device, coupling, options, clock=clock, recording=self.record, observer=window
         )
-        if window is not None:
-            window.on_command = partial(bridge.command, by="view")
-            if isinstance(device, MouseDevice):
-                window.on_hand = device.aim
+        attach_window(window, bridge, device)
         if not self.as_json:
             for setup in bridge.setups:
                 announce(setup, self.coupling, is_method_chosen=options.method is not None)
         with working("rehearsing the start of the run"):
             stack.enter_context(bridge)
         interrupts.hand_over(bridge.stop_on_signal)  # also while it closes: never cut short
-        if window is not None:
-            steer = "drag the arrows at the tool, and " if isinstance(device, MouseDevice) else ""
-            notify(f"view: {window.url} (open it in a browser; {steer}Ctrl-C ends the run)")
+        announce_window(window, device)
         if not self.as_json:
             announce_measured(bridge)
         try:
@@ -651,8 +673,3 @@ class Run:
             "simulated time (--duration takes another)"
         )
         return DEFAULT_SECONDS
-
-    def _window(self) -> Window:
-        from hapticbridge.view import Address, Window  # noqa: PLC0415 - for --view alone
-
-        return Window(Address() if self.port is None else Address(self.port))

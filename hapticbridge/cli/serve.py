@@ -14,7 +14,14 @@ from threading import Thread
 from typing import ClassVar
 
 from hapticbridge.arguments import option
-from hapticbridge.cli.run import announce, refuse_overwriting
+from hapticbridge.cli.run import (
+    announce,
+    announce_window,
+    attach_window,
+    is_mouse,
+    open_window,
+    refuse_overwriting,
+)
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, working
 from hapticbridge.clock import RealClock
 from hapticbridge.coupling import Coupling
@@ -77,6 +84,11 @@ class Serve:
     """Run in simulated time, which the program moves: DeviceLoop(is_simulated=True)."""
     coupling: Mapping[str, float] = option(gains_of=Coupling)
     options: BridgeOptions = DEFAULT_OPTIONS
+    view: bool = False
+    """Show handle and tool in a browser; the device 'mouse' needs it and has it. Needs the extra
+    'view'."""
+    view_port: int | None = option(None, least=0, most=65535)
+    """Port of the view on this machine, by default 8080; 0 takes any free one."""
     as_json: bool = option(False, flag="json")
     """Print address and summary as JSON, and end when the program leaves."""
 
@@ -88,6 +100,8 @@ class Serve:
         token = os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(18)
         options = program_options(self.options)
         is_shown = not self.as_json and err.is_terminal
+        is_viewed = self.view or is_mouse(self.device)
+        window = open_window(self.view_port) if is_viewed else None
         with ExitStack() as stack:
             interrupts = stack.enter_context(interrupting_on_signals())
             prepare_run(lambda left: notify(words(left)))
@@ -99,13 +113,16 @@ class Serve:
                     replace(options, live=is_shown),
                     clock=clock,
                     recording=self.record,
+                    observer=window,
                 )
+            attach_window(window, bridge, bridge.device)
             if not self.as_json:
                 announce(bridge.setup, self.coupling, is_method_chosen=False)
             endpoint = Endpoint(self.host, self.port, token.encode(), self._on_leave(bridge, clock))
             with working("rehearsing the start of the run"):
                 stack.enter_context(bridge)
             interrupts.hand_over(bridge.stop_on_signal)
+            announce_window(window, bridge.device)
             endpoint.open(bridge)
             if self.as_json:
                 leave = self._on_leave(bridge, clock)

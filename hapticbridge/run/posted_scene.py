@@ -44,6 +44,7 @@ class PostedScene:
 
     Args:
         front: The bridge's bound kernel, which shows the tool.
+        data: Data of the scene, in which the tool is moved for pictures alone.
         parameters: Parameters of the run, with a ``credit``.
         posts: All posts of a recorded run; none for a live one.
 
@@ -59,10 +60,12 @@ class PostedScene:
     def __init__(
         self,
         front: BoundKernel,
+        data: mujoco.MjData,
         parameters: RunParameters,
         posts: NDArray[np.void] | None = None,
     ) -> None:
         self.bound = self._front = front
+        self._data = data
         self._posts = np.zeros(0, POST_DTYPE) if posts is None else posts
         self._waiting: deque[NDArray[np.void]] = deque(maxlen=MAX_WAITING)
         self._taken: list[NDArray[np.void]] = []
@@ -110,7 +113,14 @@ class PostedScene:
 
     def note_picture(self, publish: Callable[[BoundKernel], None]) -> None:
         """Publishes the tool for an observer."""
+        self._draw()
         publish(self._front)
+
+    def _draw(self) -> None:
+        pose = self._front.state["pose"][0]
+        if self._data.qpos.size < 7:  # a recorded scene that this package did not make
+            return
+        self._data.qpos[:3], self._data.qpos[3:7] = pose["tool_position"], pose["tool_quaternion"]
 
     def settle(self) -> None:
         """Does nothing: no step is under way."""
@@ -129,7 +139,9 @@ class PostedScene:
         """Runs the ticks of a recorded run; arguments and result as for ``simulate_posted``."""
         state, row = self._front.state, self._front.row
         recorded = external_flags, elapsed, scene_steps
-        return simulate_posted(state, samples, recorded, self._posts, row, rows)
+        done = simulate_posted(state, samples, recorded, self._posts, row, rows)
+        self._draw()
+        return done
 
 
 def posts_in(events: Sequence[Mapping[str, Any]]) -> NDArray[np.void]:

@@ -441,7 +441,7 @@ class Session:
         bound = BoundKernel(scene.model, scene.data, parameters)
         resources.callback(bound.release)
         if parameters.credit > 0.0:
-            self.beside = PostedScene(bound, parameters)
+            self.beside = PostedScene(bound, scene.data, parameters)
         elif parameters.scene_ticks:
             self.beside = slow = SlowScene(bound, scene.model, scene.data, parameters)
             if not self.clock.may_wait:
