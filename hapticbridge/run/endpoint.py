@@ -60,11 +60,16 @@ LAST_WORDS = 0.3
 
 _TOOL = """<mujoco model="tool of another program">
   <option gravity="0 0 0"/>
+  <statistic extent="0.2"/>
   <custom><numeric name="{name}" data="{credit!r}"/></custom>
+  <asset>
+    <texture name="sky" type="skybox" builtin="flat" rgb1=".9 .9 .9" width="8" height="8"/>
+  </asset>
   <worldbody>
     <body name="tool">
       <freejoint/>
-      <geom size="0.01" mass="1" contype="0" conaffinity="0"/>
+      <geom size="0.01" mass="1" contype="0" conaffinity="0" rgba=".2 .4 .8 1"/>
+      <camera name="tool" mode="track" pos="0 -0.3 0.15" xyaxes="1 0 0 0 0.4 0.9"/>
       <site name="grip"/>
     </body>
   </worldbody>
