@@ -196,3 +196,16 @@ def test_numbers_in_another_notation_are_refused_at_their_line(tmp_path: Path, t
     path.write_text(f"t,x,y,z\n0,0,0,0\n1,{text},0,0\n", encoding="utf-8")
     with pytest.raises(DeviceError, match=r"line 3: column 'x' holds .* not a number"):
         open_device(f"trajectory:{path}")
+
+
+def test_a_bag_in_sqlite_and_a_folder_of_several_are_told(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    (bag / "bag_0.db3").write_bytes(b"SQLite format 3\0")
+    for path in (bag, bag / "bag_0.db3"):
+        with pytest.raises(DeviceError, match="in SQLite; 'ros2 bag convert' writes it in MCAP"):
+            open_device(f"trajectory:{path}")
+    for name in ("a.mcap", "b.mcap"):
+        (tmp_path / name).touch()
+    with pytest.raises(DeviceError, match="a folder of 2 files; name one of 'a.mcap', 'b.mcap'"):
+        open_device(f"trajectory:{tmp_path}")

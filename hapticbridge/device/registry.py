@@ -422,6 +422,7 @@ def _open_trajectory(rest: str, options: Mapping[str, object]) -> Device:
     if topic or (_is_recording(path) and is_bag(path)):
         return TrajectoryDevice(read_bag(path, topic), **limits)
     if not _is_recording(path):
+        _refuse_other_bag(path)
         return TrajectoryDevice(read_motion(path), **limits)
     # imported here, because the package device must not depend on recordings; only the replay of a
     # recording needs the reader
@@ -453,6 +454,25 @@ def _named_topic(text: str) -> tuple[Path, str]:
     except (OSError, ValueError):  # reading it as a motion then reports the reason
         return Path(text), ""
     return bags[0] if len(bags) == 1 else path, f"/{topic}" if is_named else ""
+
+
+def _refuse_other_bag(path: Path) -> None:
+    """Refuses a bag of ROS 2 in SQLite, and a folder of several bags.
+
+    Raises:
+        DeviceError: It is one.
+    """
+    try:
+        files = sorted(path.iterdir()) if path.is_dir() else [path]
+    except OSError:  # reading it as a motion then reports the reason
+        return
+    if any(file.suffix == ".db3" for file in files):
+        raise DeviceError(
+            f"{path}: a bag of ROS 2 in SQLite; 'ros2 bag convert' writes it in MCAP, which is read"
+        )
+    bags = [file.name for file in files if file.suffix == ".mcap"]
+    if len(bags) > 1:
+        raise DeviceError(f"{path}: a folder of {len(bags)} files; name one of {choices(bags[:8])}")
 
 
 def _is_recording(path: Path) -> bool:

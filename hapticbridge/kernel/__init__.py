@@ -13,6 +13,7 @@ the ``parameters`` of a run.
 - Safety: ``tick_guard`` refuses samples and has the lever between device and handle,
   ``swing_watch`` finds a device with a late or reversed force, ``passivity_controller`` observes
   the energy at the device.
-- Methods: ``lossless`` with ``springs``, ``shown_tool`` for a slower scene, ``compared_methods``.
+- Methods: ``lossless`` with ``springs``, ``shown_tool`` for a scene that is slower or another
+  program's, ``compared_methods``.
 - Base: ``mujoco_c`` gives access to MuJoCo's functions and memory; ``codes`` are names and numbers.
 """
