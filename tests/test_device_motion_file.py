@@ -207,5 +207,5 @@ def test_a_bag_in_sqlite_and_a_folder_of_several_are_told(tmp_path: Path) -> Non
             open_device(f"trajectory:{path}")
     for name in ("a.mcap", "b.mcap"):
         (tmp_path / name).touch()
-    with pytest.raises(DeviceError, match="a folder of 2 files; name one of 'a.mcap', 'b.mcap'"):
+    with pytest.raises(DeviceError, match=r"a folder of 2 files; name one of 'a\.mcap', 'b\.mcap'"):
         open_device(f"trajectory:{tmp_path}")
