@@ -26,6 +26,7 @@ SAID = {
     "first_run": "passive bit for bit",
     "key_moves_motor": "strict",
     "own_mujoco_loop": "passive",
+    "own_ros_topics": "N, passive",
     "own_map": "implicitfast  K = 4000 N/m, 0.05 kg: active",
     "plot_with_pandas": "of the time in contact",
     "scene_in_python": "strict",

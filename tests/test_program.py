@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import json
+import struct
 import subprocess
 import sys
+import time
+from contextlib import suppress
 from types import ModuleType
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+from mcap.records import Schema
+from mcap_ros2.decoder import DecoderFactory
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.program.device_loop import DeviceLoop, Handle
 from hapticbridge.program.poses import offset_between, quaternion_about, turn_between
+from hapticbridge.program.ros_topics import WRENCH_ON_TOOL, RosTopics
+from hapticbridge.recording.ros_messages import LOG, TOPICS
 
 ALONE = """
 import importlib, sys
@@ -33,7 +43,11 @@ assert hapticbridge.DeviceLoop.__module__ == "hapticbridge.program.device_loop"
 
 @pytest.mark.parametrize(
     ("module", "code"),
-    [("hapticbridge.program.device_loop", 0), ("hapticbridge.run.endpoint", 1)],
+    [
+        ("hapticbridge.program.device_loop", 0),
+        ("hapticbridge.recording.ros_messages", 0),
+        ("hapticbridge.run.endpoint", 1),
+    ],
 )
 def test_the_programs_side_needs_numpy_alone(module: str, code: int) -> None:
     done = subprocess.run(
@@ -151,3 +165,73 @@ def test_an_environment_without_the_tool_or_without_mujoco_gets_a_sentence(wrapp
     del bare.model
     with pytest.raises(HapticBridgeError, match="no MuJoCo scene in Environment"):
         wrapper(bare, loop, "tip", action)
+
+
+# Topics of ROS 2: a viewer's side of the WebSocket, and decoders that are not ours
+
+
+def messages_of(port: int, update: Any, seconds: float = 10.0) -> dict[str, Any]:
+    """Subscribes to all topics as a viewer does, and returns the first message of each."""
+    with connect(f"ws://127.0.0.1:{port}", subprotocols=[Subprotocol("foxglove.sdk.v1")]) as link:
+        channels: list[dict[str, Any]] = []
+        while len(channels) < 5:
+            told = json.loads(link.recv(10.0))
+            channels += told.get("channels", [])
+        wanted = [{"id": k, "channelId": channel["id"]} for k, channel in enumerate(channels)]
+        link.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+        found: dict[str, Any] = {}
+        end = time.monotonic() + seconds
+        while len(found) < 5 and time.monotonic() < end:
+            update()
+            with suppress(TimeoutError):
+                data = link.recv(0.02)
+                assert isinstance(data, bytes)
+                kind, number, _ = struct.unpack_from("<BIQ", data)
+                channel = channels[number]
+                assert kind == 1
+                schema = Schema(
+                    id=1,
+                    name=channel["schemaName"],
+                    encoding=channel["schemaEncoding"],
+                    data=channel["schema"].encode(),
+                )
+                decode = DecoderFactory().decoder_for(channel["encoding"], schema)
+                assert decode is not None
+                found.setdefault(channel["topic"], decode(data[13:]))
+        return found
+
+
+def test_a_viewer_reads_the_topics_of_a_loop() -> None:
+    half = np.sqrt(0.5)
+    tool = np.array([0.1, 0.2, 0.3, half, 0.0, 0.0, half])
+    with DeviceLoop("simulated", is_simulated=True) as loop:
+        for _ in range(25):
+            loop.wrench(tool)
+            loop.advance(0.02)
+        wrench = loop.wrench(tool)
+        assert np.abs(wrench[:3]).max() > 1e-3
+        with RosTopics(loop, port=0) as topics:
+            found = messages_of(topics.port, lambda: topics.update(tool, wrench))
+            with pytest.raises(HapticBridgeError, match=f"port {topics.port} of '127.0.0.1'"):
+                RosTopics(loop, port=topics.port)
+        handle = loop.pose()
+    assert set(found) == set(TOPICS) - {LOG}
+    pose = found["/handle_pose"].pose.position
+    assert [pose.x, pose.y, pose.z] == pytest.approx(handle.position)
+    assert found["/tool_pose"].header.frame_id == "world"
+    assert [frame.child_frame_id for frame in found["/tf"].transforms] == ["handle", "tool"]
+    force = found["/wrench_on_tool"].wrench.force  # the tool stands a quarter turn about z
+    assert [force.x, force.y, force.z] == pytest.approx([wrench[1], -wrench[0], wrench[2]])
+    hand = found["/wrench_on_hand"].wrench.force
+    length = np.linalg.norm([hand.x, hand.y, hand.z])
+    assert length == pytest.approx(np.linalg.norm(handle.wrench[:3]))
+
+
+def test_a_wrench_that_a_program_does_not_tell_is_not_published() -> None:
+    with DeviceLoop("simulated", is_simulated=True) as loop:
+        loop.show([0.0, 0.0, 0.0])
+        with RosTopics(loop, port=0) as topics:
+            found = messages_of(topics.port, lambda: topics.update([0.0, 0.0, 0.0]), seconds=1.0)
+            with pytest.raises(HapticBridgeError, match="pose has shape"):
+                topics.update([0.0])
+    assert set(found) == set(TOPICS) - {LOG, WRENCH_ON_TOOL}
