@@ -18,6 +18,7 @@ import numpy as np
 from lerobot.teleoperators.config import TeleoperatorConfig
 from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+from numpy.typing import NDArray
 
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.program.device_loop import DeviceLoop
@@ -45,6 +46,9 @@ class HapticDeviceConfig(TeleoperatorConfig):  # type: ignore[misc]  # LeRobot h
         is_simulated: True for simulated time.
         python: Interpreter of the environment that has the loop.
         open_gripper: Value of ``ee.gripper_pos`` for an open gripper; 0 is closed.
+        start: Pose of the robot's end effector at the start, 6 numbers as in the action, for
+            programs that send no feedback. Without it the first feedback has to come before the
+            first action, because the action is a place to which the robot goes.
         options: Options of ``hapticbridge serve``, as ``{scale: 2, scene_rate: 30}``.
     """
 
@@ -53,7 +57,14 @@ class HapticDeviceConfig(TeleoperatorConfig):  # type: ignore[misc]  # LeRobot h
     is_simulated: bool = False
     python: str | None = None
     open_gripper: float = 100.0
+    start: list[float] = field(default_factory=list)
     options: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if len(self.start) not in (0, len(POSE_NAMES)):
+            raise HapticBridgeError(
+                f"start has {len(self.start)} numbers; it needs those of {', '.join(POSE_NAMES)}"
+            )
 
 
 class HapticDevice(Teleoperator):  # type: ignore[misc]
@@ -109,7 +120,8 @@ class HapticDevice(Teleoperator):  # type: ignore[misc]
             **config.options,
         ).__enter__()
         self._has_feedback = False
-        self.loop.show([0.0, 0.0, 0.0, *_UPRIGHT])
+        if config.start:
+            self.loop.show(_pose(np.array(config.start)))
 
     def calibrate(self) -> None:
         """Does nothing: the device is calibrated by its driver."""
@@ -118,8 +130,17 @@ class HapticDevice(Teleoperator):  # type: ignore[misc]
         """Does nothing: the configuration has all options."""
 
     def get_action(self) -> dict[str, float]:
-        """Returns the handle's pose, and closes the gripper while the button is held."""
+        """Returns the handle's pose, and closes the gripper while the button is held.
+
+        Raises:
+            HapticBridgeError: Neither feedback nor ``start`` says where the robot is.
+        """
         loop = self._open_loop()
+        if not (self._has_feedback or self.config.start):
+            raise HapticBridgeError(
+                "it is not known where the robot is: send feedback before the first action, or set "
+                "start to the pose of its end effector"
+            )
         handle = loop.pose()
         if not self._has_feedback:  # the handle itself is shown, and moves freely
             loop.show(np.append(handle.position, handle.quaternion), handle.velocity)
@@ -139,8 +160,7 @@ class HapticDevice(Teleoperator):  # type: ignore[misc]
         if missing:
             raise HapticBridgeError(f"the feedback has no {', '.join(missing)}")
         numbers = np.array([float(feedback[name]) for name in POSE_NAMES])
-        pose = np.append(numbers[:3], quaternion_about(numbers[3:]))
-        loop.show(pose, is_placed=not self._has_feedback)
+        loop.show(_pose(numbers), is_placed=not self._has_feedback)
         self._has_feedback = True
 
     def disconnect(self) -> None:
@@ -152,3 +172,7 @@ class HapticDevice(Teleoperator):  # type: ignore[misc]
         if self.loop is None:
             raise DeviceNotConnectedError
         return self.loop
+
+
+def _pose(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.append(numbers[:3], quaternion_about(numbers[3:]))

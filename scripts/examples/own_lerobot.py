@@ -30,6 +30,5 @@ with teleop:
         loop.advance(0.02)  # not in real time
 dataset.save_episode()
 dataset.finalize()
-print(
-    len(LeRobotDataset("local/own", root=Path("own_dataset"))), "frames,", loop.summary["verdict"]
-)
+loaded = LeRobotDataset("local/own", root=Path("own_dataset"))
+print(f"{len(loaded)} frames, {loop.summary['peak_force']:.2f} N, {loop.summary['verdict']}")
