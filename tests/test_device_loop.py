@@ -139,6 +139,18 @@ def test_a_loop_that_cannot_start_says_why(device: str, options: Any, words: str
         pass
 
 
+def test_a_python_without_the_loop_gets_advice(tmp_path: Path) -> None:
+    bare = tmp_path / "python"
+    bare.write_text("#!/bin/sh\necho \"No module named 'rich'\" >&2\nexit 1\n")
+    bare.chmod(0o755)
+    words = "named 'rich' .*python= or HAPTICBRIDGE_PYTHON names a Python"
+    with pytest.raises(HapticBridgeError, match=words), DeviceLoop("simulated", python=bare):
+        pass
+    with pytest.raises(HapticBridgeError) as its_own, DeviceLoop("no such device"):
+        pass
+    assert "HAPTICBRIDGE_PYTHON" not in str(its_own.value)
+
+
 def test_a_loop_that_dies_is_lost_and_not_waited_for() -> None:
     with DeviceLoop("simulated", is_simulated=True) as device:
         device.show(START)

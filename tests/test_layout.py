@@ -204,7 +204,10 @@ SMALL = 80
 INTERFACES = {
     "hapticbridge.audit.spring",  # second computation, apart from all that it checks
     "hapticbridge.program.messages",  # between two processes
+    "hapticbridge.program.gymnasium",  # imported by users' programs
     "hapticbridge.program.poses",  # for interfaces to other programs, too
+    "hapticbridge.program.robosuite",  # imported by users' programs
+    "hapticbridge.program.ros_topics",  # imported by users' programs
     "hapticbridge.lazy",  # imported by package files, which are not counted
     "hapticbridge.device.transport.maker_library",  # libraries of makers, for any driver
     "hapticbridge.run.programs",  # run by scripts/setup and the builder of wheels too

@@ -231,7 +231,7 @@ class StepTimes:
     period: float
     substeps: int
     scene_ticks: int
-    credit: float
+    credit: float = 0.0
 
     @property
     def scene_period(self) -> float:

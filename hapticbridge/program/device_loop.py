@@ -21,7 +21,7 @@ from hapticbridge.errors import DeviceLost, HapticBridgeError, SafetyTrip
 from hapticbridge.kernel.record import PLANES, POST_DTYPE, TICK_DTYPE
 from hapticbridge.program.loop_process import TOKEN_VARIABLE, LoopProcess
 from hapticbridge.program.messages import CALL_DTYPE, STATE_DTYPE, VERSION, Call, packed, unpacked
-from hapticbridge.program.poses import matrix_of, numbers_of, pose_of, turn_between
+from hapticbridge.program.poses import matrix_of, numbers_of, offset_between, pose_of
 
 Array = NDArray[np.float64]
 
@@ -260,12 +260,12 @@ class DeviceLoop:
         with self._lock:
             work = 0.0
             if self._has_shown:
-                moved = np.append(own[:3] - self._shown[:3], turn_between(self._shown[3:], own[3:]))
-                work = float(self._applied @ moved)
+                work = float(self._applied @ offset_between(self._shown, own))
             stiffness, damping, turning, turn_damping = state["gains"]
             speed = velocity_of_handle - post["velocity"][0]
-            force = stiffness * (handle[:3] - own[:3]) + damping * speed[:3]
-            torque = turning * turn_between(own[3:], handle[3:]) + turn_damping * speed[3:]
+            offset = offset_between(own, handle)
+            force = stiffness * offset[:3] + damping * speed[:3]
+            torque = turning * offset[3:] + turn_damping * speed[3:]
             is_first = not self._has_shown
             share = 0.0 if is_first else float(state["lever"])
             level, torque_level = state["levels"]

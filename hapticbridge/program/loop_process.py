@@ -21,6 +21,9 @@ READY_TIME, CLOSE_TIME = 300.0, 60.0
 """Longest waits in s: for a loop that starts (the first start compiles), and for one that ends and
 closes its recording."""
 
+ADVICE = "python= or HAPTICBRIDGE_PYTHON names a Python with all that hapticbridge depends on"
+"""Advice for an interpreter that cannot run the loop."""
+
 KEPT_LINES = 20
 """Lines of its standard error that are kept, to say why it ended."""
 
@@ -71,7 +74,11 @@ class LoopProcess:
             return str(told["host"]), int(told["port"])
         except (ValueError, KeyError, TypeError):
             self.end()
-            raise HapticBridgeError(f"the device loop cannot start: {self.last_error}") from None
+            is_its_own = any(line.startswith(_HEADS) for line in self._lines)
+            advice = "" if is_its_own else f" ({self._command[0]}; {ADVICE})"
+            raise HapticBridgeError(
+                f"the device loop cannot start: {self.last_error}{advice}"
+            ) from None
         except BaseException:  # as Ctrl-C while it compiles
             self.end()
             raise

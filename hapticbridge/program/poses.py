@@ -92,6 +92,12 @@ def quaternion_of(matrix: Array) -> Array:
     return np.asarray(q / np.linalg.norm(q) * (1.0 if q[0] >= 0 else -1.0))
 
 
+def quaternion_about(vector: Array) -> Array:
+    """Returns the quaternion of a rotation vector in rad."""
+    half = 0.5 * float(np.linalg.norm(vector))
+    return np.append(np.cos(half), 0.5 * np.sinc(half / np.pi) * vector)
+
+
 def turn_between(first: Array, second: Array) -> Array:
     """Returns the rotation vector in rad from one quaternion to another, in the world frame."""
     v, u = second[1:], first[1:]
@@ -100,3 +106,11 @@ def turn_between(first: Array, second: Array) -> Array:
     sign = -1.0 if real < 0.0 else 1.0
     angle_ratio = 2.0 if size < 1e-9 else 2.0 * np.arctan2(size, sign * real) / size
     return np.asarray(sign * angle_ratio * vector)
+
+
+def offset_between(first: Array, second: Array) -> Array:
+    """Returns what leads from one pose (x, y, z, qw, qx, qy, qz) to another.
+
+    Translation in m and rotation vector in rad, (6,), in the world frame.
+    """
+    return np.append(second[:3] - first[:3], turn_between(first[3:], second[3:]))
