@@ -67,23 +67,33 @@ def format_energy(joules: float) -> str:
     return format_si(joules if abs(joules) >= ROUNDING else 0.0, "J")
 
 
-def shown_energies(energies: Mapping[str, float], start_potential: float) -> dict[str, float]:
+def shown_energies(
+    energies: Mapping[str, float], start_potential: float, credit: float = 0.0
+) -> dict[str, float]:
     """Returns energies in J under the names that are printed.
 
-    The potential has an arbitrary zero, so its change since the start of the run is shown.
+    The potential has an arbitrary zero, so its change since the start of the run is shown. That of
+    another program's scene is a tank for the tool, which began with the hand's credit in J. Nothing
+    else is known of such a scene, so no energy of it is shown.
     """
     shown = {}
     for name, joules in energies.items():
-        if name == "potential":
+        if credit and name == "potential":
+            shown["tank"] = joules / start_potential * credit
+        elif credit and name == "environment_energy":
+            continue
+        elif name == "potential":
             shown["potential change"] = joules - start_potential
         else:
             shown[name.replace("_", " ")] = joules
     return shown
 
 
-def energy_rows(energies: Mapping[str, float], start_potential: float) -> Iterator[tuple[str, str]]:
+def energy_rows(
+    energies: Mapping[str, float], start_potential: float, credit: float = 0.0
+) -> Iterator[tuple[str, str]]:
     """Yields name and text of each energy that is not exactly 0, as one without motors is."""
-    for name, joules in shown_energies(energies, start_potential).items():
+    for name, joules in shown_energies(energies, start_potential, credit).items():
         if joules:
             yield name, format_energy(joules)
 

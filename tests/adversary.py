@@ -333,7 +333,7 @@ class Attack:
         states, own = (kernel.state, slow.state), (kernel.row, slow.row, np.zeros(1, SAMPLE_DTYPE))
         hand = np.zeros(1, HAND_DTYPE)
         hand["quaternion"][0, 0] = 1.0
-        hand["credit"] = self.allowed * credit
+        hand["credit"] = self.allowed * parameters.tank_at_start
         times = 10 ** rng.uniform([-2.7, -2.7, -1.5], [-0.7, -0.7, 0.3]) / period
         habits = np.array(
             [

@@ -12,15 +12,16 @@ import pytest
 from adversary import UNPAID, Attack
 from numpy.typing import NDArray
 
-from hapticbridge import Bridge, BridgeOptions, SimulatedClock, Summary, audit
+from hapticbridge import Bridge, BridgeOptions, SimulatedClock, Summary, Workspace, audit
 from hapticbridge.audit import AuditReport
+from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.record import POST_DTYPE
+from hapticbridge.kernel.record import POST_DTYPE, SAMPLE_DTYPE
 from hapticbridge.recording import read_recording
 from hapticbridge.run.commands import Couple, Repeat, Reset, Switch
 from hapticbridge.run.endpoint import posted_scene, program_options
-from hapticbridge.run.posted_scene import EVENT
+from hapticbridge.run.posted_scene import EVENT, is_post
 
 CREDIT = 0.05
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -35,10 +36,6 @@ def attack(seed: int, **changes: Any) -> float:
 
 def test_no_hand_gets_more_from_a_program_than_its_credit() -> None:
     assert max(attack(seed) for seed in range(150)) <= UNPAID
-
-
-def test_hands_do_get_most_of_the_credit() -> None:
-    assert max(attack(seed, allowed=0.5) for seed in range(150)) > UNPAID
 
 
 def test_a_program_that_nobody_pays_for_is_seen_to_give_joules() -> None:
@@ -147,7 +144,7 @@ def test_before_the_first_pose_there_is_no_force() -> None:
 
 
 def test_a_tool_that_is_pulled_away_stops_where_the_credit_ends() -> None:
-    """The spring to a hand that is held takes ½ K d², and the damper (B/T) d² of one step."""
+    """At a hand that is held the coupling's force K d + (B/T) d acts on one step of d."""
 
     def pulls(bridge: Bridge, tick: int) -> None:
         if tick % 20 == 0:
@@ -156,7 +153,7 @@ def test_a_tool_that_is_pulled_away_stops_where_the_credit_ends() -> None:
     summary, records = run(pulls, device="simulated:hand=none,friction=100", duration=1.5)
     away = float(records["tool_position"][-1, 0] - records["handle_position"][-1, 0])
     law = summary.coupling.law
-    expected = math.sqrt(CREDIT / (0.5 * law.stiffness + law.damping / 1e-3))
+    expected = math.sqrt(CREDIT / (law.stiffness + law.damping / 1e-3))
     assert away == pytest.approx(expected, rel=0.01)
     assert records["scene_tank"][-1] == pytest.approx(0.0, abs=1e-9)
 
@@ -239,6 +236,116 @@ def test_a_reset_is_the_programs_own(tmp_path: Path) -> None:
     assert records["lever"][700] < 0.05
     assert np.linalg.norm(records["wrench_on_tool"][700:1000, :3], axis=1).max() < 10.0
     assert judged(tmp_path / "run.mcap").agreement == "bit for bit"
+
+
+# A hand with a ledger of its own
+
+
+class YieldingHand:
+    """Device in a hand that moves as it likes: with its force, at a share of the speed w/b.
+
+    ``got`` is the largest energy in J so far that the force gave beyond what b burned.
+    """
+
+    def __init__(self, delay: int = 0, share: float = 0.5, begin: int = 400) -> None:
+        self.info = DeviceInfo(
+            name="yielding",
+            axes=("x",),
+            damping=2.0,
+            mass=0.1,
+            force_limit=10.0,
+            friction=0.0,
+            resolution=0.0,
+            delay=1e-3 * delay,
+            is_delay_measured=True,
+            is_real=False,
+        )
+        self.got, self._net, self._share, self._begin = 0.0, 0.0, share, begin
+        self._place, self._tick, self._forces = 0.0, 0, [0.0] * (delay + 1)
+
+    def start(self, period: float) -> NDArray[np.void]:
+        self._period, sample = period, np.zeros(1, SAMPLE_DTYPE)
+        sample["quaternion"][0] = UPRIGHT
+        return sample
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        force, b = self._forces[0], 2.0
+        if self._tick > self._begin:
+            speed = float(np.clip(self._share * force / b, -3.0, 3.0))
+            self._place += speed * self._period
+            self._net += (force - b * speed) * speed * self._period
+            self.got = max(self.got, self._net)
+        self._tick += 1
+        sample["position"][0], sample["quaternion"][0] = (self._place, 0.0, 0.0), UPRIGHT
+        return 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self._forces = [*self._forces[1:], float(wrench[0])]
+
+    def close(self) -> None:
+        pass
+
+
+def got_from(program: Program, hand: YieldingHand, stiffness: float, **options: Any) -> float:
+    """Returns the energy in J that a hand got."""
+    own = program_options(BridgeOptions(**options))
+    coupling = {"stiffness": stiffness, "damping": 0.0}
+    scene = posted_scene(CREDIT)
+    with Bridge(scene, hand, coupling, own, clock=SimulatedClock()) as bridge:
+        if program is unpaid:
+            bridge.session.kernel.state["shown"]["tank"] = 1e9
+        bridge.run(3.0, lambda tick: program(bridge, tick))
+    return hand.got
+
+
+def jumps(bridge: Bridge, tick: int) -> None:
+    """Shows the tool 5 mm to both sides of the handle in turn, so that a late force helps it."""
+    if tick % 2 == 0:
+        side = 0.005 if tick % 4 else -0.005
+        shows(bridge, post_of(handle_of(bridge) + np.array([side, 0.0, 0.0]), has_velocity=1))
+
+
+def unpaid(bridge: Bridge, tick: int) -> None:
+    jumps(bridge, tick)
+    bridge.session.kernel.state["shown"]["tank"] = 1e9
+
+
+def test_a_force_that_arrives_after_a_jump_of_the_tool_gives_no_more_than_the_credit() -> None:
+    assert got_from(jumps, YieldingHand(delay=1, begin=0), 980.0) <= CREDIT + UNPAID
+    assert got_from(unpaid, YieldingHand(delay=1, begin=0), 980.0) > 10.0
+
+
+@pytest.mark.parametrize("force_scale", [0.5, 1.0, 3.0])
+def test_the_credit_is_that_of_the_hand_at_any_scale_of_the_force(force_scale: float) -> None:
+    """A tool that goes on before a hand that follows slowly gives it nearly all of the credit."""
+
+    def leads(bridge: Bridge, tick: int) -> None:
+        if tick % 20 == 0:
+            shows(bridge, post_of(handle_of(bridge) + np.array([0.003, 0.0, 0.0])))
+
+    hand = YieldingHand(share=0.1)
+    got = got_from(leads, hand, 600.0, workspace=Workspace(force_scale=force_scale))
+    assert 0.7 * CREDIT < got <= CREDIT + UNPAID
+
+
+def test_a_work_that_is_stated_and_taken_back_fills_no_tank() -> None:
+    """7 nJ are lost in the rounding of 1e8 J, and would be found again."""
+
+    def lies(bridge: Bridge, tick: int) -> None:
+        shows(bridge, post_of((0.0, 0.0, 0.0), work=(0.0, 1e8, 7e-9)[tick % 3]))
+
+    _, records = run(lies, device="simulated:hand=none", duration=0.5)
+    assert np.all(records["scene_tank"] <= CREDIT)
+
+
+def test_normals_of_another_length_are_no_post() -> None:
+    post = post_of((0.0, 0.0, 0.0), planes=1)
+    post["normals"][0, :3] = (0.0, 0.6, 0.8)
+    assert is_post(post[0])
+    post["normals"][0, :3] = (0.0, 0.6, 1e8)
+    assert not is_post(post[0])
+    post["planes"] = -1
+    assert not is_post(post[0])
 
 
 # What was changed is found

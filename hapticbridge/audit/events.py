@@ -322,7 +322,7 @@ class AuditState:
             "handle": starts["handle_start"],
             "tool": starts["tool_start"],
         }
-        row["scene_tank"] = parameters.credit
+        row["scene_tank"] = parameters.tank_at_start
         for body, pose in poses.items():
             row[f"{body}_position"], row[f"{body}_quaternion"] = pose[:3], pose[3:]
         return cls(

@@ -367,7 +367,8 @@ def _print_report(report: AuditReport) -> None:
     rate = f", {certification.kept.remark}" if certification and certification.kept.remark else ""
     unfinished = "; the tick that tripped is not among them" if report.trip else ""
     out.print(f"  {report.ticks} ticks, {report.duration:.3f} s{rate}{unfinished}")
-    if energies := [" ".join(row) for row in energy_rows(report.energies, report.start_potential)]:
+    rows = energy_rows(report.energies, report.start_potential, report.credit)
+    if energies := [" ".join(row) for row in rows]:
         out.print(f"  {', '.join(energies)}")
 
 

@@ -224,7 +224,8 @@ class StepTimes:
         period: T in s.
         substeps: MuJoCo steps per tick, or between two results of a slower scene.
         scene_ticks: Ticks between two results of a slower scene; 0 if it steps in every tick.
-        credit: Energy in J that another program's scene may give; 0 for a scene of the bridge.
+        credit: Energy in J that another program's scene may give to the hand; 0 for a scene of the
+            bridge.
     """
 
     __slots__ = ()
@@ -350,6 +351,14 @@ class RunParameters(StepTimes):
     def device_delay(self) -> float:
         """Delay t_d in s that the device states, in whole ticks, rounded up."""
         return whole_ticks(self.guarding.stated_delay, self.period) * self.period
+
+    @property
+    def tank_at_start(self) -> float:
+        """Energy in J in front of another program's scene, at the tool; ``credit`` is at the hand.
+
+        Whatever the tool gets or gives is force_scale/scale times as much at the hand.
+        """
+        return self.credit * self.scale / self.force_scale
 
     @property
     def levels_on_tool(self) -> tuple[float, float]:

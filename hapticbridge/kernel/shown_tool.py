@@ -36,14 +36,21 @@ the hand cannot get more than the scene has released. The next handle that the s
 drawn so near to its tool that the springs hold no more than the credit + D. The credit is what they
 hold at the force level, F²/2K + F_r²/2K_r, at the present gains.
 
+A device that answers late holds the force from before a jump of y for longer. What its condition
+counts on is ½ K ‖δh − δy‖² in each tick (``theory.bounds.minimum_damping``), of which the above
+leaves ½ K ‖δh‖². So behind a delay the coupling gives what it gives to any scene, P = f·δy, which
+is never more. So it does before another program, whose tool may jump in every tick, and a wrench
+is always sent some time after its sample.
+
 Another program may step the scene and post the tool's pose when it has one, at any rate. Without a
 velocity the tool is led to the posted pose within the time between the last two posts. Nothing is
 known of the program's energy but the work W that it states, and W < 0 counts as 0: the tank begins
 with a stated credit E_0, and the hand gets at most E_0 beyond what it put in, whatever is posted:
 
-    D = E_0 + Σ P − max(W, 0) >= 0
+    D = E_0/q + Σ P − max(W, 0) >= 0,    q = force_scale / scale
 
-The scene's stored energy is then D itself, because that is all that it may still give.
+An energy at the tool is q times as much at the hand, where the credit is stated. The scene's stored
+energy is then D itself, because that is all that it may still give.
 """
 
 from __future__ import annotations
@@ -101,6 +108,9 @@ SLOWEST = 0.25
 TRIALS, NEAR = 8, 1.0 - 1e-6
 """Largest number of motions that are tried for the largest one that the tank pays for, and share of
 the root of a parabola that is tried. Two or three are enough unless the force is at its level."""
+
+ROUNDING = 2.0**-51
+"""Largest share of two stated works by which their difference and the tank may be rounded."""
 
 FASTEST, FASTEST_TURN = 1.0, 10.0
 """Speeds in m/s and rad/s up to which the tool passes on the coupling's whole wrench in time."""
@@ -167,7 +177,7 @@ def bind_shown(shown: Part, parameters: RunParameters) -> None:
     shown["passing"] = 2.0 * power * of_scene.period
     shown["horizon"] = LONGEST * of_scene.period
     if parameters.credit > 0.0:
-        shown["is_posted"], shown["tank"] = 1, parameters.credit
+        shown["is_posted"], shown["tank"] = 1, parameters.tank_at_start
 
 
 def tool_geoms(model: mujoco.MjModel, grip_site: int) -> NDArray[np.int32]:
@@ -272,7 +282,8 @@ def take_posted(state: NDArray[np.void], posts: NDArray[np.void]) -> None:
     shown, pose = s.shown, s.pose
     since = min(max(shown.silence, 1) * s.run.period, SLOWEST)
     work = max(post.work, 0.0)
-    shown.tank -= work - shown.scene_work
+    # less what the sums may round up, or a program that states much and takes it back would gain
+    shown.tank -= work - shown.scene_work + ROUNDING * (work + shown.scene_work)
     shown.scene_work = work
     position, orientation = vector_of(post.pose), canonical(quaternion_of(post.pose[3:7]))
     store_vector(shown.before[0:3], position)
@@ -414,6 +425,8 @@ def _shown_at(
 def _released_energy(s: State, before: float, share: float, step: Vector, turn: Vector) -> float:
     """Returns P, the energy in J that the coupling gives if the tool moves by a share."""
     position, orientation, force, torque, moved, turned = _shown_at(s, share, step, turn)
+    if s.shown.is_posted or s.timing.device_delay_ns > 0:
+        return float(dot(force, moved) + dot(torque, turned))
     linear, angular = springs(s)
     stretch = subtract(vector_of(s.pose.handle_position), position)
     twist = rotation_between(orientation, quaternion_of(s.pose.handle_quaternion))

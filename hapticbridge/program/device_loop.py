@@ -310,7 +310,7 @@ class DeviceLoop:
 
     @property
     def credit(self) -> float:
-        """Energy in J that the program may still give to the hand: the tank."""
+        """Energy in J that the program may still give to the hand: what the tank has."""
         return float(self._newest()["credit"])
 
     @property

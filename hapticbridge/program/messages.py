@@ -79,8 +79,9 @@ STATE_DTYPE = np.dtype(
 )
 """From the loop to the program: number of the message, of the newest ADVANCE and a PLACE that are
 done, 1 at the end of the run and 2 at one by the guard, 1 if the time is simulated, tick, bits of
-the buttons, share of the wrench that is sent (0 while the handle does not follow), T in s, the tank
-in J, the handle's pose and velocity in the program's frame, the wrench on the device in N and N m,
+the buttons, share of the wrench that is sent (0 while the handle does not follow), T in s, what
+the tank has for the hand in J, the handle's pose and velocity in the program's frame, the wrench on
+the device in N and N m,
 the requested K, B, K_r, B_r, the coupling's levels on the tool in N and N m, and why the run
 ended."""
 

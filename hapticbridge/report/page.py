@@ -220,7 +220,7 @@ def _controller_words(evidence: Evidence) -> str:
 
 def balance_of(report: AuditReport) -> str:
     """Returns the energies at the end of a run."""
-    rows = energy_rows(report.energies, report.start_potential)
+    rows = energy_rows(report.energies, report.start_potential, report.credit)
     return ", ".join(" ".join(row) for row in rows) or "nothing"
 
 

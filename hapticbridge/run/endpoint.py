@@ -174,6 +174,7 @@ class Endpoint:
         self._bridge, session = bridge, bridge.session
         assert session.posted is not None  # the scene is that of ``posted_scene``
         self._scene, parameters = session.posted, session.parameters
+        self._ratio = parameters.force_scale / parameters.scale
         self._is_absolute = bridge.setup.workspace.absolute
         self._told["period"], coupling = parameters.period, bridge.setup.coupling
         self._told["gains"] = (
@@ -234,7 +235,10 @@ class Endpoint:
             post[0] = call["post"]
             if kind == Call.PLACE and not self._is_absolute:
                 placed = {"event": "reset", "pose": post["pose"][0].tolist(), "by": "program"}
-                self._bridge.session.commands.waiting.append((Repeat((placed,)), "program"))
+                waiting = self._bridge.session.commands.waiting
+                if len(waiting) == waiting.maxlen:
+                    return False  # or a flood would push a user's command out; it is placed again
+                waiting.append((Repeat((placed,)), "program"))
             if kind == Call.PLACE and self._told["placed"] == self._placed[0]:
                 self._placed = self._newest, self._bridge.session.tick + 1
             self._scene.post(post)
@@ -255,7 +259,8 @@ class Endpoint:
         first, last = rows[0], rows[-1]
         told["tick"], told["buttons"], told["lever"] = last["tick"], last["buttons"], last["lever"]
         told["handle"][0] = [*last["handle_position"], *last["handle_quaternion"]]
-        told["wrench"][0], told["credit"] = last["wrench_on_device"], last["scene_tank"]
+        told["wrench"][0] = last["wrench_on_device"]
+        told["credit"] = self._ratio * last["scene_tank"]
         span = float(last["tick"] - first["tick"]) * float(told["period"][0])
         moved = last["handle_position"] - first["handle_position"]
         turned = np.zeros(3)

@@ -168,11 +168,15 @@ def _decoded(events: Sequence[Mapping[str, Any]]) -> Iterator[NDArray[np.void]]:
 
 
 def is_post(post: np.void) -> bool:
-    """Returns True if the numbers of a post are finite and in range, as the loop needs them."""
+    """Returns True if the numbers of a post are finite and in range, as the loop needs them.
+
+    Its quaternion and the normals of its surfaces have the length 1.
+    """
     names = [name for name in POST_DTYPE.names or () if POST_DTYPE[name].base == np.float64]
-    norm = float(np.linalg.norm(post["pose"][3:]))
-    return (
-        0 <= post["planes"] <= PLANES
-        and abs(norm - 1.0) < 1e-9
-        and all(bool(np.all(np.abs(post[name]) < 1e9)) for name in names)
-    )
+    if not 0 <= post["planes"] <= PLANES:
+        return False
+    if not all(bool(np.all(np.abs(post[name]) < 1e9)) for name in names):
+        return False
+    normals = post["normals"].reshape(PLANES, 3)[: post["planes"]]
+    norms = np.append(np.linalg.norm(normals, axis=1), np.linalg.norm(post["pose"][3:]))
+    return bool(np.all(np.abs(norms - 1.0) < 1e-9))

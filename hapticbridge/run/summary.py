@@ -395,11 +395,9 @@ class Summary:
         yield "peak", peak + reached
         if self.reach is not None:
             yield "reach", f"{format_si(self.reach, 'm')}; beyond, no handle and no force"
-        energies = dict(self.energies)
-        if self.credit:
-            left = format_energy(energies.pop("potential"))
-            yield "tank", f"{left}, what the program may still give to the hand"
-        yield from energy_rows(energies, self.start_potential)
+        for name, text in energy_rows(self.energies, self.start_potential, self.credit):
+            of_tank = ", what the program may still give to the hand" if name == "tank" else ""
+            yield name, text + of_tank
         if self.max_net_energy > INSTANT:
             yield "net to the hand", self.hand_energy.sentence
         elif not self.credit and (release := self.hand_energy.release):
