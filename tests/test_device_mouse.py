@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from view_cases import FLOOR
 
 from hapticbridge.audit import audit
-from hapticbridge.cli.run import Run
 from hapticbridge.device.mouse import REST, MouseDevice, Pose, line_of_pose, pose_of_line
 from hapticbridge.errors import DeviceError, HapticBridgeError
 from hapticbridge.kernel.record import SAMPLE_DTYPE
@@ -96,10 +95,10 @@ def test_another_line_is_no_pose(line: bytes) -> None:
 def test_the_command_shows_the_view_by_itself(
     call: Called, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(_: Run) -> None:
+    def refused(_: int | None) -> None:
         raise HapticBridgeError("the view")
 
-    monkeypatch.setattr(Run, "_window", refused)
+    monkeypatch.setattr("hapticbridge.cli.run.open_window", refused)
     for options in ((), ("--port", "0")):
         code, _, err = call("run", "point_mass", "--device", "mouse", *options)
         assert (code, err) == (2, "error: the view\n")
