@@ -20,11 +20,27 @@ import mujoco
 import numpy as np
 import pytest
 
-from hapticbridge import DeviceLoop, audit, read_recording
+from hapticbridge import (
+    Bridge,
+    BridgeOptions,
+    DeviceLoop,
+    SimulatedClock,
+    audit,
+    read_recording,
+)
 from hapticbridge.errors import DeviceLost, HapticBridgeError
 from hapticbridge.program import device_loop, poses
 from hapticbridge.program.device_loop import Handle, Surface
-from hapticbridge.program.messages import CALL_DTYPE, STATE_DTYPE, Call, packed, unpacked
+from hapticbridge.program.messages import (
+    CALL_DTYPE,
+    STATE_DTYPE,
+    VERSION,
+    Call,
+    packed,
+    unpacked,
+)
+from hapticbridge.run.commands import MAX_WAITING, Repeat, Switch
+from hapticbridge.run.endpoint import Endpoint, posted_scene, program_options
 
 TOKEN = "a token of the tests"
 START = np.array([0.1, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
@@ -223,6 +239,30 @@ def test_a_datagram_without_the_token_or_of_another_kind_is_dropped() -> None:
         assert unpacked(damaged, CALL_DTYPE, b"right") is None
     call["version"] = 2
     assert unpacked(packed(call, b"right"), CALL_DTYPE, b"right") is None
+
+
+def test_a_flood_of_places_pushes_no_command_of_a_user_out() -> None:
+    options = program_options(BridgeOptions())
+    with Bridge(posted_scene(0.05), "simulated", None, options, clock=SimulatedClock()) as bridge:
+        waiting = bridge.session.commands.waiting
+        bridge.command(Switch(force=False))
+        endpoint = Endpoint("127.0.0.1", 0, TOKEN.encode())
+        endpoint.open(bridge)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
+            program.settimeout(10.0)
+            program.connect(endpoint.address)
+            call = np.zeros(1, CALL_DTYPE)
+            call["version"], call["call"], call["post"]["pose"] = VERSION, Call.PLACE, START
+            for sequence in range(1, 31):
+                call["sequence"] = sequence
+                program.send(packed(call, TOKEN.encode()))
+            end = time.monotonic() + 10.0
+            while len(waiting) < MAX_WAITING and time.monotonic() < end:
+                program.recv(4096)
+        endpoint.close()
+        assert len(waiting) == MAX_WAITING
+        assert waiting[0][0] == Switch(force=False)
+        assert all(isinstance(command, Repeat) for command, _ in list(waiting)[1:])
 
 
 class Network:
