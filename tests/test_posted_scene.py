@@ -38,6 +38,11 @@ def test_no_hand_gets_more_from_a_program_than_its_credit() -> None:
     assert max(attack(seed) for seed in range(150)) <= UNPAID
 
 
+def test_a_tool_that_turns_past_half_a_turn_gives_nothing() -> None:
+    """There the torque's work is more than the spring loses; 42 mJ beyond the credit were seen."""
+    assert attack(741) <= UNPAID
+
+
 def test_a_program_that_nobody_pays_for_is_seen_to_give_joules() -> None:
     assert max(attack(seed, pays=False) for seed in range(60)) > 1.0
 

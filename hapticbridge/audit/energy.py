@@ -97,8 +97,8 @@ def _springs_at_start(parameters: RunParameters, gains: Array, motion: Motion) -
 def shown_work(block: AuditedBlock, events: RunEvents) -> Array:
     """Returns P, the coupling's work on a tool that is shown between a scene's steps, (n,) in J.
 
-    It is that for a device in time. Behind a delay, and before another program, P is f·δx + τ·δφ,
-    as for any scene.
+    It is that for a device in time. Behind a delay, and before another program, P is f·δx + τ·δφ
+    where that is less.
 
         P = V(h − y_{k−1}) − V(h − y_k) + f_d·δy + the same for torques
 
@@ -225,8 +225,9 @@ class EnergyBalance:
         totals = {"throughput": _summed(np.abs(work), before["throughput"])}
         # with several laws per tick the mean wrench does not determine the summed work
         coupling_work = ticks["coupling_work"]
-        if parameters.scene_ticks and not (block.is_posted or parameters.device_delay):
-            work = shown_work(block, events)
+        if parameters.scene_ticks:
+            exact, is_late = shown_work(block, events), parameters.device_delay > 0.0
+            work = np.minimum(exact, work) if block.is_posted or is_late else exact
         if parameters.law_evaluations == 1:
             coupling_work = _summed(work, before["coupling_work"])
         stored = ticks["kinetic"] + ticks["potential"] - block.state.start_energy

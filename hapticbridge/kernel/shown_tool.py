@@ -38,9 +38,10 @@ hold at the force level, F²/2K + F_r²/2K_r, at the present gains.
 
 A device that answers late holds the force from before a jump of y for longer. What its condition
 counts on is ½ K ‖δh − δy‖² in each tick (``theory.bounds.minimum_damping``), of which the above
-leaves ½ K ‖δh‖². So behind a delay the coupling gives what it gives to any scene, P = f·δy, which
-is never more. So it does before another program, whose tool may jump in every tick, and a wrench
-is always sent some time after its sample.
+leaves ½ K ‖δh‖². So behind a delay the coupling gives what it gives to any scene, P = f·δy + τ·δφ,
+where that is not more. It may be more where a twist passes half a turn, because V is not convex
+there. So it does before another program, whose tool may jump in every tick, and a wrench is always
+sent some time after its sample.
 
 Another program may step the scene and post the tool's pose when it has one, at any rate. Without a
 velocity the tool is led to the posted pose within the time between the last two posts. Nothing is
@@ -425,15 +426,15 @@ def _shown_at(
 def _released_energy(s: State, before: float, share: float, step: Vector, turn: Vector) -> float:
     """Returns P, the energy in J that the coupling gives if the tool moves by a share."""
     position, orientation, force, torque, moved, turned = _shown_at(s, share, step, turn)
-    if s.shown.is_posted or s.timing.device_delay_ns > 0:
-        return float(dot(force, moved) + dot(torque, turned))
+    work = dot(force, moved) + dot(torque, turned)
     linear, angular = springs(s)
     stretch = subtract(vector_of(s.pose.handle_position), position)
     twist = rotation_between(orientation, quaternion_of(s.pose.handle_quaternion))
     elastic = limited(linear, scaled(linear.stiffness, stretch))
     elastic_r = limited(angular, scaled(angular.stiffness, twist))
     damped = dot(subtract(force, elastic), moved) + dot(subtract(torque, elastic_r), turned)
-    return float(before - _stored(s, position, orientation) + damped)
+    exact = before - _stored(s, position, orientation) + damped
+    return float(min(exact, work) if s.shown.is_posted or s.timing.device_delay_ns > 0 else exact)
 
 
 @compiled
