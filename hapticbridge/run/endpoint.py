@@ -11,7 +11,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -54,6 +54,9 @@ REPORT_PERIOD = 2e-3
 
 SPEED_TIME = 0.01
 """Time in s over which the handle's velocity is taken."""
+
+STOP_LOOK = 0.1
+"""Time in s between two looks for a request to end the run, while simulated time stands still."""
 
 LAST_WORDS = 0.3
 """Time in s for which the end of the run is told again, because a datagram may be lost."""
@@ -103,12 +106,14 @@ class GrantedClock(SimulatedClock):
 
     Attributes:
         done: Number of the newest grant of which all ticks have ended.
+        stops: Requests to end the run, for which time goes on.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self._granted, self._number, self.done = 0, 0, 0
         self._is_open, self._wake = False, threading.Condition()
+        self.stops: Collection[object] = ()
 
     def grant(self, ticks: int, number: int) -> None:
         """Lets a number of ticks pass."""
@@ -127,7 +132,8 @@ class GrantedClock(SimulatedClock):
         with self._wake:
             if not self._granted:
                 self.done = self._number
-            self._wake.wait_for(lambda: self._granted or self._is_open)
+            while not (self._granted or self._is_open or self.stops):
+                self._wake.wait(timeout=STOP_LOOK)
             self._granted = max(self._granted - 1, 0)
         return super().wait()
 
@@ -185,6 +191,8 @@ class Endpoint:
         )
         self._told["levels"] = parameters.levels_on_tool
         self._told["is_simulated"] = isinstance(bridge.clock, GrantedClock)
+        if isinstance(bridge.clock, GrantedClock):
+            bridge.clock.stops = session.stop.waiting
         self._ticks = max(round(SPEED_TIME / parameters.period), 1)
         self._thread = threading.Thread(target=self._work, name="endpoint", daemon=True)
         self._thread.start()
