@@ -43,7 +43,7 @@ class MovedHandle:
 
     def pose(self) -> Handle:
         """Returns the handle, whose first button is held."""
-        return Handle(self.target[:3], self.target[3:], np.zeros(6), 1, np.zeros(6), True)
+        return Handle(self.target[:3], self.target[3:], np.zeros(6), 1, np.nan, np.zeros(6), True)
 
 
 def distance(name: str, robots: str | list[str], number: int) -> NDArray[np.float64]:

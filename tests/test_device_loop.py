@@ -19,6 +19,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from test_grip_axis import Fingers
 
 from hapticbridge import (
     Bridge,
@@ -40,7 +41,7 @@ from hapticbridge.program.messages import (
     unpacked,
 )
 from hapticbridge.run.commands import MAX_WAITING, Repeat, Switch
-from hapticbridge.run.endpoint import Endpoint, posted_scene, program_options
+from hapticbridge.run.endpoint import Endpoint, GrantedClock, posted_scene, program_options
 
 TOKEN = "a token of the tests"
 START = np.array([0.1, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
@@ -230,15 +231,69 @@ def test_rotations_are_those_of_mujoco() -> None:
 
 def test_a_datagram_without_the_token_or_of_another_kind_is_dropped() -> None:
     call = np.zeros(1, CALL_DTYPE)
-    call["version"], call["call"] = 1, Call.SHOW
+    call["version"], call["call"] = VERSION, Call.SHOW
     data = packed(call, b"right")
     assert unpacked(data, CALL_DTYPE, b"right") == call[0]
     assert unpacked(data, CALL_DTYPE, b"wrong") is None
     assert unpacked(data, STATE_DTYPE, b"right") is None
     for damaged in (b"", data[:-1], data + b"\0", bytes([data[0] ^ 1]) + data[1:]):
         assert unpacked(damaged, CALL_DTYPE, b"right") is None
-    call["version"] = 2
+    call["version"] = VERSION + 1
     assert unpacked(packed(call, b"right"), CALL_DTYPE, b"right") is None
+
+
+@contextmanager
+def endpoint_of(device: Any) -> Iterator[str]:
+    """Runs a loop in simulated time in this process, and yields its remote name."""
+    clock = GrantedClock()
+    options = program_options(BridgeOptions())
+    with Bridge(posted_scene(0.05), device, None, options, clock=clock) as bridge:
+        endpoint = Endpoint("127.0.0.1", 0, TOKEN.encode())
+        endpoint.open(bridge)
+        run = threading.Thread(target=bridge.run)
+        run.start()
+        try:
+            yield f"remote:127.0.0.1:{endpoint.address[1]}"
+        finally:
+            bridge.stop("test")
+            run.join()
+            endpoint.close()
+
+
+def test_a_program_that_starts_anew_has_the_loop_and_the_other_is_told() -> None:
+    with (
+        endpoint_of("simulated") as name,
+        DeviceLoop(name, token=TOKEN) as first,
+        DeviceLoop(name, token=TOKEN) as second,
+    ):
+        first.show(START)
+        end = time.monotonic() + 10.0
+        with pytest.raises(DeviceLost, match="another program has taken over"):
+            while time.monotonic() < end:
+                first.show(START)
+        second.show(START)
+        second.advance(0.1)
+        with DeviceLoop(name, token=TOKEN) as last:
+            last.show([0.3, 0.0, 0.0])
+            last.advance(0.01)
+            assert last.pose().position == pytest.approx([0.3, 0.0, 0.0], abs=1e-3)
+            first.close()  # a farewell of a program without the loop ends nothing
+            last.advance(0.01)
+
+
+def test_a_grip_axis_is_read_and_gets_no_force() -> None:
+    fingers = Fingers(speed=0.01)
+    with endpoint_of(fingers) as name, DeviceLoop(name, token=TOKEN) as device:
+        device.show(START)
+        device.advance(0.2)
+        assert device.pose().grip == pytest.approx(0.002, abs=1e-4)
+    assert {each.shape for each in fingers.sent} == {(6,)}
+    with DeviceLoop("simulated", is_simulated=True) as device:
+        device.show(START)
+        device.advance(0.5)
+        handle = device.pose()
+        assert np.isnan(handle.grip)
+        assert (handle.is_held, handle.buttons) == (False, 0)  # the force is off: no pose for long
 
 
 def test_a_flood_of_places_pushes_no_command_of_a_user_out() -> None:

@@ -110,6 +110,17 @@ def test_without_velocity_the_tool_arrives_after_one_interval() -> None:
     assert x[119:] == pytest.approx(1e-4)
 
 
+def test_of_several_poses_within_a_tick_the_newest_counts() -> None:
+    def program(bridge: Bridge, tick: int) -> None:
+        for x in (0.1, -0.2, 1e-3 * (tick >= 1000)):
+            shows(bridge, post_of([x, 0.0, 0.0]))
+
+    _, records = run(program, device="simulated:hand=none")
+    assert np.all(np.diff(records["scene_step"]) == 1)
+    assert records["tool_position"][-1, 0] == pytest.approx(1e-3, abs=1e-5)
+    assert np.abs(records["tool_position"][:, 0]).max() < 1.1e-3
+
+
 def test_with_a_velocity_it_moves_on_and_a_surface_stops_it() -> None:
     def moves(bridge: Bridge, tick: int) -> None:
         if tick == 0:

@@ -47,6 +47,8 @@ class Handle(NamedTuple):
         quaternion: Orientation (w, x, y, z), (4,), w >= 0.
         velocity: Velocity in m/s and rad/s, (6,), over the last 10 ms.
         buttons: Bits of the buttons that are held.
+        grip: How far the device's grip axis is closed in m, as a gripper between the fingers; it
+            is read, and gets no force. NaN without one.
         wrench: Force in N and torque in N m on the device, (6,), in its own frame.
         is_held: True if the handle follows the device; False while a clutch is held, or no pose was
             shown for a while.
@@ -56,6 +58,7 @@ class Handle(NamedTuple):
     quaternion: Array
     velocity: Array
     buttons: int
+    grip: float
     wrench: Array
     is_held: bool
 
@@ -142,7 +145,7 @@ class DeviceLoop:
         self._process = None if self._remote else LoopProcess(command, self._token.decode())
         self._lock = threading.Lock()
         self._call = np.zeros(1, CALL_DTYPE)
-        self._call["version"], self._call["sequence"] = VERSION, time.time_ns()
+        self._call["version"], self._call["program"] = VERSION, secrets.randbits(63)
         self._state: np.void = np.zeros(1, STATE_DTYPE)[0]
         self._has_state, self._has_shown = threading.Event(), False
         self._socket: socket.socket | None = None
@@ -201,6 +204,7 @@ class DeviceLoop:
             quaternion=handle[3:].copy(),
             velocity=velocity.copy(),
             buttons=int(state["buttons"]),
+            grip=float(state["grip"]),
             wrench=state["wrench"].copy(),
             is_held=bool(state["lever"] > 0.0),
         )
@@ -395,7 +399,9 @@ class DeviceLoop:
             except OSError:
                 return
             state = unpacked(data, STATE_DTYPE, self._token)
-            if state is not None and state["sequence"] > self._state["sequence"]:
+            if state is None or state["program"] != self._call["program"]:
+                continue
+            if state["sequence"] > self._state["sequence"]:
                 self._state, self._heard = state, time.monotonic()
                 self._has_state.set()
 

@@ -3,7 +3,8 @@
 Each datagram tells the newest state, so one that is lost or overtaken needs no repetition: the
 receiver drops what is older than what it has. Both sides hold the token; the tag is HMAC-SHA256 of
 the record under it. A datagram without the right tag, of another size or version, or older than the
-newest one is dropped. What is told is not secret: across a network that others read, use a tunnel.
+newest one of the same program is dropped. A loop serves the program that greeted it last. What is
+told is not secret: across a network that others read, use a tunnel.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.kernel.record import POST_DTYPE
 
-VERSION = 1
+VERSION = 2
 """Version of the datagrams; both sides must have the same one."""
 
 TAG = 16
@@ -47,18 +48,20 @@ class Call(IntEnum):
 CALL_DTYPE = np.dtype(
     [
         ("version", "<i8"),
+        ("program", "<i8"),
         ("sequence", "<i8"),
         ("call", "<i8"),
         ("ticks", "<i8"),
         ("post", POST_DTYPE),
     ]
 )
-"""From the program to the loop: number of the call, what it is (``Call``), ticks of simulated time,
-and the tool as shown last."""
+"""From the program to the loop: a random number that stands for the program, number of its call,
+what it is (``Call``), ticks of simulated time, and the tool as shown last."""
 
 STATE_DTYPE = np.dtype(
     [
         ("version", "<i8"),
+        ("program", "<i8"),
         ("sequence", "<i8"),
         ("answered", "<i8"),
         ("placed", "<i8"),
@@ -69,6 +72,7 @@ STATE_DTYPE = np.dtype(
         ("lever", "<f8"),
         ("period", "<f8"),
         ("credit", "<f8"),
+        ("grip", "<f8"),
         ("handle", "<f8", 7),
         ("velocity", "<f8", 6),
         ("wrench", "<f8", 6),
@@ -77,13 +81,13 @@ STATE_DTYPE = np.dtype(
         ("words", f"S{WORDS}"),
     ]
 )
-"""From the loop to the program: number of the message, of the newest ADVANCE and a PLACE that are
-done, 1 at the end of the run and 2 at one by the guard, 1 if the time is simulated, tick, bits of
-the buttons, share of the wrench that is sent (0 while the handle does not follow), T in s, what
-the tank has for the hand in J, the handle's pose and velocity in the program's frame, the wrench on
-the device in N and N m,
-the requested K, B, K_r, B_r, the coupling's levels on the tool in N and N m, and why the run
-ended."""
+"""From the loop to the program: the program that is meant, number of the message, of the newest
+ADVANCE and a PLACE that are done, 1 at the end of the run and 2 at one by the guard, 1 if the time
+is simulated, tick, bits of the buttons, share of the wrench that is sent (0 while the handle does
+not follow), T in s, what the tank has for the hand in J, how far the device's grip axis is closed
+in m (NaN without one), the handle's pose and velocity in the program's frame, the wrench on the
+device in N and N m, the requested K, B, K_r, B_r, the coupling's levels on the tool in N and N m,
+and why the run ended."""
 
 
 def packed(record: NDArray[np.void], token: bytes) -> bytes:

@@ -261,7 +261,7 @@ class Bridge:
         kernel, model, data = session.kernel, self.scene.model, self.scene.data
         wait, now, stops = self.clock.wait, self.clock.now, self._stop.waiting
         read_device, write_device = checked_read(self.device), checked_write(self.device)
-        state, row, sample = kernel.state, kernel.row, kernel.sample
+        state, row, sample, samples = kernel.state, kernel.row, kernel.sample, session.samples
         before, answer, finish = kernel.before, kernel.answer, kernel.finish
         step, first_half, second_half = kernel.step, kernel.first_half, kernel.second_half
         stream, rows, cursors, wrench = session.stream, kernel.rows, kernel.cursors, kernel.wrench
@@ -274,7 +274,7 @@ class Bridge:
                 on_tick(session.tick)
             if inputs or commands or later:
                 session.take_changes()
-            flags = external_flags[0] = read_device(sample)
+            flags = external_flags[0] = read_device(samples)
             last_read, read = read, now()
             elapsed = 1e-9 * (read - last_read)
             for substep in substeps:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 from hapticbridge.kernel.record import POST_DTYPE
+from hapticbridge.kernel.tick_guard import DEVICE_BUTTONS
 from hapticbridge.program.messages import (
     CALL_DTYPE,
     STATE_DTYPE,
@@ -60,6 +61,8 @@ STOP_LOOK = 0.1
 
 LAST_WORDS = 0.3
 """Time in s for which the end of the run is told again, because a datagram may be lost."""
+
+TAKEN_OVER = "another program has taken over the device loop; one at a time has it"
 
 _TOOL = """<mujoco model="tool of another program">
   <option gravity="0 0 0"/>
@@ -115,6 +118,11 @@ class GrantedClock(SimulatedClock):
         self._is_open, self._wake = False, threading.Condition()
         self.stops: Collection[object] = ()
 
+    def begin(self) -> None:
+        """Takes back what was granted to another program, and counts grants from 0."""
+        with self._wake:
+            self._granted = self._number = self.done = 0
+
     def grant(self, ticks: int, number: int) -> None:
         """Lets a number of ticks pass."""
         with self._wake:
@@ -169,8 +177,9 @@ class Endpoint:
         self.address: tuple[str, int] = self._socket.getsockname()[:2]
         self._token, self._on_leave = token, on_leave
         self._peer: Any = None
-        self._newest = 0
+        self._calls: dict[int, int] = {}  # of each program, the number of its newest call
         self._placed = 0, 0  # number of the call, and tick after which it is done
+        self._thread = threading.Thread(target=self._work, name="endpoint", daemon=True)
         self._told = np.zeros(1, STATE_DTYPE)
         self._told["version"] = VERSION
         self._is_closed = False
@@ -190,17 +199,17 @@ class Endpoint:
             coupling.rotational_damping,
         )
         self._told["levels"] = parameters.levels_on_tool
+        self._grip = session.samples["position"][1:, 0]
         self._told["is_simulated"] = isinstance(bridge.clock, GrantedClock)
         if isinstance(bridge.clock, GrantedClock):
             bridge.clock.stops = session.stop.waiting
         self._ticks = max(round(SPEED_TIME / parameters.period), 1)
-        self._thread = threading.Thread(target=self._work, name="endpoint", daemon=True)
         self._thread.start()
 
     def close(self, error: BaseException | None = None) -> None:
         """Tells the program that the run is over, and why; then closes the port."""
         self._is_closed = True
-        if hasattr(self, "_thread"):
+        if self._thread.is_alive():
             self._thread.join()
             self._told["is_over"] = 2 if isinstance(error, SafetyTrip) else 1
             words = "the device loop has ended" if error is None else str(error)
@@ -218,9 +227,7 @@ class Endpoint:
         while not self._is_closed:
             # in time, or a message to a program that is gone comes back as an error
             with suppress(OSError):
-                data, peer = self._socket.recvfrom(4096)
-                if self._hear(data, peer) and self._on_leave is not None:
-                    self._on_leave()
+                self._hear(*self._socket.recvfrom(4096))
             now = time.monotonic()
             is_answered = isinstance(clock, GrantedClock) and clock.done != answered
             if self._peer is not None and (now >= due or is_answered):
@@ -231,28 +238,51 @@ class Endpoint:
                 self._note_state()
                 self._tell()
 
-    def _hear(self, data: bytes, peer: Any) -> bool:
-        """Takes a call; returns True if the program leaves."""
+    def _hear(self, data: bytes, peer: Any) -> None:
+        """Takes a call; a program that greets takes the loop over."""
         call = unpacked(data, CALL_DTYPE, self._token)
-        if call is None or call["sequence"] <= self._newest:
-            return False
-        self._newest, self._peer = int(call["sequence"]), peer
-        clock, kind = self._bridge.clock, int(call["call"])
-        if kind in (Call.SHOW, Call.PLACE) and is_post(call["post"]):
+        if call is None:
+            return
+        program, number, kind = int(call["program"]), int(call["sequence"]), int(call["call"])
+        if number <= self._calls.get(program, 0):
+            return
+        self._calls[program] = number
+        if program != self._told["program"]:
+            if kind != Call.GREET:
+                self._refuse(program, peer)
+                return
+            self._begin(program)
+        self._peer = peer
+        if kind == Call.ADVANCE and isinstance(self._bridge.clock, GrantedClock):
+            self._bridge.clock.grant(max(int(call["ticks"]), 1), number)
+        elif kind == Call.LEAVE and self._on_leave is not None:
+            self._on_leave()
+        elif kind in (Call.SHOW, Call.PLACE) and is_post(call["post"]):
             post = np.zeros(1, POST_DTYPE)
             post[0] = call["post"]
             if kind == Call.PLACE and not self._is_absolute:
                 placed = {"event": "reset", "pose": post["pose"][0].tolist(), "by": "program"}
                 waiting = self._bridge.session.commands.waiting
                 if len(waiting) == waiting.maxlen:
-                    return False  # or a flood would push a user's command out; it is placed again
+                    return  # or a flood would push a user's command out; it is placed again
                 waiting.append((Repeat((placed,)), "program"))
             if kind == Call.PLACE and self._told["placed"] == self._placed[0]:
-                self._placed = self._newest, self._bridge.session.tick + 1
+                self._placed = number, self._bridge.session.tick + 1
             self._scene.post(post)
-        elif kind == Call.ADVANCE and isinstance(clock, GrantedClock):
-            clock.grant(max(int(call["ticks"]), 1), self._newest)
-        return kind == Call.LEAVE
+
+    def _begin(self, program: int) -> None:
+        """Counts calls, placed tools and granted time from 0 for a new program."""
+        self._told["program"], self._told["placed"], self._placed = program, 0, (0, 0)
+        if isinstance(self._bridge.clock, GrantedClock):
+            self._bridge.clock.begin()
+
+    def _refuse(self, program: int, peer: Any) -> None:
+        """Tells a program that another one has the loop."""
+        told = self._told.copy()
+        told["program"], told["sequence"], told["is_over"] = program, told["sequence"] + 1, 1
+        told["words"] = TAKEN_OVER.encode()
+        with suppress(OSError):
+            self._socket.sendto(packed(told, self._token), peer)
 
     def _note_state(self) -> None:
         """Notes what the newest tick's record says."""
@@ -260,12 +290,14 @@ class Endpoint:
         told, state = self._told, self._bridge.session.kernel.state
         if self._bridge.session.tick > self._placed[1]:
             told["placed"] = self._placed[0]
+        told["grip"] = self._grip[0] if self._grip.size else np.nan
         if not len(rows):
             pose = state["pose"][0]
             told["handle"][0] = [*pose["handle_position"], *pose["handle_quaternion"]]
             return
         first, last = rows[0], rows[-1]
-        told["tick"], told["buttons"], told["lever"] = last["tick"], last["buttons"], last["lever"]
+        told["tick"], told["lever"] = last["tick"], last["lever"]
+        told["buttons"] = last["buttons"] & DEVICE_BUTTONS
         told["handle"][0] = [*last["handle_position"], *last["handle_quaternion"]]
         told["wrench"][0] = last["wrench_on_device"]
         told["credit"] = self._ratio * last["scene_tank"]

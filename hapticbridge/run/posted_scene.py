@@ -2,7 +2,7 @@
 
     bridge's loop, every T                        another program, at its own rate
     before_step: the handle moves
-    exchange: the oldest waiting post is taken ◀── post: pose, velocity, surfaces, work
+    exchange: the newest post is taken        ◀── post: pose, velocity, surfaces, work
     answer_step: the shown tool's wrench
 
 Neither waits for the other. Every post that was taken over is an event of the recording, and the
@@ -35,9 +35,6 @@ PATIENCE, PATIENT_PERIODS = 0.25, 5.0
 """Time in s without a post after which the force fades, and in periods of a slow program. A hand
 then feels a tool that stands still; a shorter time lets go whenever a program collects garbage."""
 
-MAX_WAITING = 64
-"""Posts that wait for the loop, which takes one in each tick; of more the oldest are left out."""
-
 
 class PostedScene:
     """Scene that another program steps, with the calls of ``SlowScene``.
@@ -67,7 +64,7 @@ class PostedScene:
         self.bound = self._front = front
         self._data = data
         self._posts = np.zeros(0, POST_DTYPE) if posts is None else posts
-        self._waiting: deque[NDArray[np.void]] = deque(maxlen=MAX_WAITING)
+        self._waiting: deque[NDArray[np.void]] = deque(maxlen=1)
         self._taken: list[NDArray[np.void]] = []
         self._slot = np.zeros(1, POST_DTYPE)
         self._take = direct(take_posted, front.state, self._slot)
@@ -77,7 +74,10 @@ class PostedScene:
         self.patience = max(PATIENCE, PATIENT_PERIODS * parameters.scene_period)
 
     def post(self, post: NDArray[np.void]) -> None:
-        """Shows the tool, from any thread; ``post`` is ``POST_DTYPE``, (1,), and kept."""
+        """Shows the tool, from any thread; ``post`` is ``POST_DTYPE``, (1,), and kept.
+
+        It takes the place of one that the loop has not taken over.
+        """
         self._waiting.append(post)
 
     @property
@@ -93,7 +93,7 @@ class PostedScene:
         return f"the program has shown no pose for {self.patience:g} s: the force is off until then"
 
     def exchange(self, _model: mujoco.MjModel, _data: mujoco.MjData) -> None:
-        """Takes over the oldest waiting post; it stands where other scenes have MuJoCo's step."""
+        """Takes over a waiting post; it stands where other scenes have MuJoCo's step."""
         if self._waiting:
             post = self._waiting.popleft()
             self._slot[0] = post[0]

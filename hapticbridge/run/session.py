@@ -257,6 +257,8 @@ class Session:
             hands, those of the first.
         hand_parameters: The parameters of each hand.
         kernel: Arithmetic of a tick.
+        samples: What the device reads: a sample of each hand, and of one hand's grip axis that
+            moves no joint.
         stream: Records and events on their way out.
         commands: Queue of commands.
         executor: Execution of the queue's commands.
@@ -341,7 +343,8 @@ class Session:
                 hands=len(self._setups),
             )
             resources.callback(self._close_stream)
-        sample = np.zeros(len(self._setups), SAMPLE_DTYPE)
+        self.samples = np.zeros(len(self._setups) + self._has_free_grip, SAMPLE_DTYPE)
+        sample = self.samples[: len(self._setups)]
         self.kernel = TickKernel(sample, self.stream)
         if clock.name == RealClock.name:
             pace = scene, setup.method, setup.scene_period, setup.substeps
@@ -353,7 +356,7 @@ class Session:
             self._grants = resources.enter_context(memory_at_rest())
         resources.callback(self._close_scene)
         resources.callback(checked_close(self.device))
-        sample[:] = checked_start(self.device)(setup.period)[: sample.size]
+        self.samples[:] = checked_start(self.device)(setup.period)[: self.samples.size]
         for each, own in zip(self._setups, self._samples(), strict=True):
             refuse_implausible_pose(each.info, own)
         self.hand_parameters = self._parameters(effective)
@@ -385,6 +388,10 @@ class Session:
     def posted(self) -> PostedScene | None:
         """Scene that another program steps; None for another scene."""
         return self.beside if isinstance(self.beside, PostedScene) else None
+
+    @property
+    def _has_free_grip(self) -> bool:
+        return len(self._setups) == 1 and self.device.info.grip_axis is not None
 
     @property
     def _chore_period(self) -> float:
