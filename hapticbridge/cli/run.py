@@ -341,6 +341,20 @@ def refuse_overwriting(record: Path | None, *devices: str, overwrite: bool) -> N
             raise RecordingError(f"'{motion}' is the motion of the run; choose another file")
 
 
+def print_summary(summary: Summary, record: Path | None, *, as_json: bool) -> None:
+    """Prints what a run has come to, for a reader or as JSON with the recording's name."""
+    if as_json:
+        print_json(summary.to_dict() | {"recording": str(record or "") or None})
+        return
+    for line in str(summary).splitlines():
+        out.print(plain(line))
+
+
+def exit_code(summary: Summary) -> int:
+    """Returns 0 for a passive run on a device that is certified or not judged, else 1."""
+    return 0 if summary.verdict == "passive" and summary.is_certified is not False else 1
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
     """Put a scene behind a haptic device and feel it.
@@ -652,16 +666,11 @@ class Run:
         if not summary.ticks and (name := bridge.session.signal):
             raise StopSignal(Signals[name])
         self._print(summary)
-        is_good = summary.verdict == "passive" and summary.is_certified is not False
-        return 0 if is_good else 1
+        return exit_code(summary)
 
     def _print(self, summary: Summary) -> None:
-        if self.as_json:
-            print_json(summary.to_dict() | {"recording": str(self.record or "") or None})
-            return
-        for line in str(summary).splitlines():
-            out.print(plain(line))
-        if self._is_viewed and self.record is not None:
+        print_summary(summary, self.record, as_json=self.as_json)
+        if not self.as_json and self._is_viewed and self.record is not None:
             notify(f"the page ends with the run; 'hapticbridge view {self.record}' plays it")
 
     def _duration(self, info: DeviceInfo) -> float | None:

@@ -18,11 +18,13 @@ from hapticbridge.cli.run import (
     announce,
     announce_window,
     attach_window,
+    exit_code,
     is_mouse,
     open_window,
+    print_summary,
     refuse_overwriting,
 )
-from hapticbridge.cli.terminal import err, notify, out, plain, print_json, working
+from hapticbridge.cli.terminal import err, notify, working
 from hapticbridge.clock import RealClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import refuse_simulated_time
@@ -130,21 +132,15 @@ class Serve:
             self._tell(endpoint, token)
             error: BaseException | None = None
             try:
-                summary = bridge.run()
+                bridge.run()
             except BaseException as caught:
                 error = caught
                 raise
             finally:
                 endpoint.close(error)
                 stack.close()
-                if error is not None and self.as_json:
-                    print_json(bridge.summary().to_dict())
-        if self.as_json:
-            print_json(summary.to_dict() | {"recording": str(self.record or "") or None})
-        else:
-            for line in str(summary).splitlines():
-                out.print(plain(line))
-        return 0 if summary.verdict == "passive" and summary.is_certified is not False else 1
+                print_summary(summary := bridge.summary(), self.record, as_json=self.as_json)
+        return exit_code(summary)
 
     def _on_leave(self, bridge: Bridge, clock: RealClock | GrantedClock) -> Callable[[], None]:
         """Returns what is done when the program leaves."""
