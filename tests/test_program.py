@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import struct
 import subprocess
 import sys
 import time
 from contextlib import suppress
-from types import ModuleType
+from dataclasses import dataclass
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -16,12 +18,19 @@ import numpy as np
 import pytest
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
+from test_device_loop import TOKEN, endpoint_of
+from test_grip_axis import Fingers
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.program.device_loop import DeviceLoop, Handle
-from hapticbridge.program.poses import offset_between, quaternion_about, turn_between
+from hapticbridge.program.poses import (
+    matrix_of,
+    offset_between,
+    quaternion_about,
+    turn_between,
+)
 from hapticbridge.program.ros_topics import WRENCH_ON_TOOL, RosTopics
 from hapticbridge.recording.ros_messages import LOG, TOPICS
 
@@ -165,6 +174,147 @@ def test_an_environment_without_the_tool_or_without_mujoco_gets_a_sentence(wrapp
     del bare.model
     with pytest.raises(HapticBridgeError, match="no MuJoCo scene in Environment"):
         wrapper(bare, loop, "tip", action)
+
+
+# LeRobot and robosuite: their base classes in a few lines, and a device whose buttons are held
+
+
+def modules(monkeypatch: pytest.MonkeyPatch, own: str, **names: Any) -> Any:
+    """Puts modules into the place of a package, and imports our interface to it anew."""
+    monkeypatch.delitem(sys.modules, own, raising=False)
+    for name, classes in names.items():
+        module = ModuleType(name.replace("__", "."))
+        vars(module).update(classes)
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    interface = importlib.import_module(own)
+    monkeypatch.delitem(sys.modules, own)
+    return interface
+
+
+@dataclass(kw_only=True)
+class Config:
+    id: str | None = None
+
+
+class Teleoperator:
+    def __init__(self, config: Config) -> None:
+        self.id = config.id
+
+
+@pytest.fixture
+def lerobot(monkeypatch: pytest.MonkeyPatch) -> Any:
+    errors = {name: type(name, (ConnectionError,), {}) for name in CONNECTION_ERRORS}
+    return modules(
+        monkeypatch,
+        "hapticbridge.program.lerobot",
+        lerobot__teleoperators__config={"TeleoperatorConfig": Config},
+        lerobot__teleoperators__teleoperator={"Teleoperator": Teleoperator},
+        lerobot__utils__errors=errors,
+    )
+
+
+CONNECTION_ERRORS = "DeviceAlreadyConnectedError", "DeviceNotConnectedError"
+AT = {"ee.x": 0.3, "ee.y": 0.0, "ee.z": 0.2, "ee.wx": 0.0, "ee.wy": 0.0, "ee.wz": 0.5}
+
+
+def test_a_teleoperator_leads_the_robot_from_where_it_is(
+    lerobot: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HAPTICBRIDGE_TOKEN", TOKEN)
+    fingers = Fingers()
+    with endpoint_of(fingers) as name:
+        device = lerobot.HapticDevice(lerobot.HapticDeviceConfig(device=name))
+        with pytest.raises(ConnectionError):
+            device.get_action()
+        device.connect()
+        with pytest.raises(ConnectionError):
+            device.connect()
+        with pytest.raises(HapticBridgeError, match="send feedback before the first action"):
+            device.get_action()
+        with pytest.raises(HapticBridgeError, match=r"the feedback has no ee\.wy, ee\.wz"):
+            device.send_feedback({name: AT[name] for name in list(AT)[:4]})
+        assert set(device.feedback_features) == set(AT)
+        for buttons, opening in ((0, 100.0), (lerobot.CLOSE, 0.0)):
+            fingers.buttons = buttons
+            device.send_feedback(AT | {"other": 1.0})
+            device.loop.advance(0.02)
+            action = device.get_action()
+            assert set(action) == set(device.action_features)
+            assert action.pop("ee.gripper_pos") == opening
+            assert action == pytest.approx(AT, abs=1e-3)
+        device.disconnect()
+        assert not device.is_connected
+
+
+def test_a_teleoperator_without_feedback_starts_where_it_is_told(lerobot: Any) -> None:
+    with pytest.raises(HapticBridgeError, match="start has 3 numbers"):
+        lerobot.HapticDeviceConfig(start=[0.0, 0.0, 0.0])
+    start = [*AT.values()]
+    device = lerobot.HapticDevice(lerobot.HapticDeviceConfig(is_simulated=True, start=start))
+    device.connect()
+    device.loop.advance(0.02)
+    action = device.get_action()
+    device.disconnect()
+    assert [action[name] for name in AT] == pytest.approx(start, abs=1e-3)
+
+
+class Controller:
+    """An OSC controller at rest, 0.1 m along x and turned by half a radian about z."""
+
+    name, input_ref_frame, use_ori = "OSC_POSE", "base", True
+    kp, kd, output_max = np.full(6, 150.0), np.full(6, 24.0), np.full(6, 0.05)
+    ref_pos, ref_pos_vel, ref_ori_vel = np.array([0.1, 0.0, 0.0]), np.zeros(3), np.zeros(3)
+    origin_pos, origin_ori = np.zeros(3), np.eye(3)
+    ref_ori_mat = matrix_of(quaternion_about(np.array([0.0, 0.0, 0.5])))
+
+    def update(self, *, force: bool) -> None:
+        assert force
+
+    def compute_goal_pos(self, delta: np.ndarray) -> Any:
+        return self.ref_pos + delta - np.array([0.01, 0.0, 0.0])  # it counts from another place
+
+    def compute_goal_ori(self, delta: np.ndarray) -> Any:
+        assert not delta.any()
+        return self.ref_ori_mat
+
+
+class RobosuiteDevice:
+    active_robot, active_arm, base_mode = 0, "right", False
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+
+    def _reset_internal_state(self) -> None:
+        pass
+
+
+def test_an_arm_is_led_to_the_handle_and_its_gripper_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robosuite = modules(
+        monkeypatch,
+        "hapticbridge.program.robosuite",
+        robosuite__controllers__parts__arm__osc={"OperationalSpaceController": Controller},
+        robosuite__devices={"Device": RobosuiteDevice},
+    )
+    controller = Controller()
+    env = SimpleNamespace(robots=[SimpleNamespace(part_controllers={"right": controller})])
+    fingers = Fingers()
+    with endpoint_of(fingers) as name, DeviceLoop(name, token=TOKEN) as loop:
+        device = robosuite.HapticDevice(env, loop)
+        device.start_control()
+        for buttons in (0, robosuite.GRASP, robosuite.RESET):
+            fingers.buttons = buttons
+            loop.advance(0.02)
+            state = device.get_controller_state()
+            assert state["dpos"] == pytest.approx([0.01, 0.0, 0.0], abs=1e-4)
+            assert state["raw_drotation"] == pytest.approx(np.zeros(3), abs=1e-4)
+            assert state["rotation"] == pytest.approx(controller.ref_ori_mat, abs=1e-4)
+            assert state["grasp"] == (buttons == robosuite.GRASP)
+            assert state["reset"] == (buttons == robosuite.RESET)
+        controller.name, controller.use_ori = "OSC_POSITION", False
+        with pytest.raises(HapticBridgeError, match="arm 'right' is OSC_POSITION; a haptic device"):
+            device.get_controller_state()
 
 
 # Topics of ROS 2: a viewer's side of the WebSocket, and decoders that are not ours
