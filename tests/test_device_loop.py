@@ -406,6 +406,18 @@ def test_a_late_and_lossy_network_moves_nothing_but_the_time(tmp_path: Path) -> 
     assert (report.verdict, report.agreement) == ("passive", "bit for bit")
 
 
+def test_simulated_time_that_no_program_moves_ends_with_ctrl_c(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with served(path, "--fast") as port:  # which interrupts it at the end
+        for _ in range(2):
+            with DeviceLoop(f"remote:127.0.0.1:{port}", token=TOKEN) as device:
+                device.show(START)
+                device.advance(0.1)
+    ticks = read_recording(path).ticks
+    assert 200 <= len(ticks) <= 201
+    assert audit(path).verdict == "passive"
+
+
 def test_a_wrong_token_gets_no_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_loop, "ANSWER_TIME", 0.5)
     with (
