@@ -71,6 +71,9 @@ class Status(IntFlag):
 ENABLE = 1
 """Byte 3 of a force frame that enables the motors."""
 
+PLANES = 3
+"""Surfaces near the tool that a loop on the board takes with a pose."""
+
 NUMBERS_PAGE, NAME_PAGE, GRIP_PAGE = 0, 1, 2
 """Pages of the sheet, byte 3 of a frame that requests or holds one."""
 

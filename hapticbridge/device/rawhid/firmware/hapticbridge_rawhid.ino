@@ -2,7 +2,7 @@
 // drive (as on the Hapkit), a quadrature encoder on the motor, and a driver with a PWM and a
 // direction pin.
 //
-// Tools > USB Type > Raw HID. Files: this sketch, hb_protocol.h and hb_protocol.cpp in one folder.
+// Tools > USB Type > Raw HID. Files: this sketch, hb_constants.h, hb_protocol.h and hb_protocol.cpp in one folder.
 // Needs only Teensyduino (its Encoder library and IntervalTimer). Then, on the computer:
 //
 //   hapticbridge devices

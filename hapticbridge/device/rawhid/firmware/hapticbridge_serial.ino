@@ -2,7 +2,7 @@
 // magnetoresistive sensor, one motor on a capstan drive), or any Arduino or ESP32 with your own
 // three functions.
 //
-// Files: this sketch, hb_protocol.h and hb_protocol.cpp in one folder named hapticbridge_serial.
+// Files: this sketch, hb_constants.h, hb_protocol.h and hb_protocol.cpp in one folder named hapticbridge_serial.
 // Board: Arduino Uno (the Hapkit is one). Then, on the computer:
 //
 //   hapticbridge devices

@@ -5,9 +5,6 @@
 
 namespace {
 
-const uint8_t MAGIC = 0x48, VERSION = 1;
-const uint8_t STATE = 0x53, SHEET = 0x44, FORCE = 0x46, ASK = 0x3F;
-const uint8_t ENABLE = 1;
 const size_t CRC_AT = HB_FRAME_BYTES - 2;
 
 // Byte by byte, so that the frame is little-endian on any processor.
@@ -43,8 +40,8 @@ float get_float(const uint8_t* at) {
 
 void begin(uint8_t* frame, uint8_t kind, uint8_t option, uint16_t sequence) {
   memset(frame, 0, HB_FRAME_BYTES);
-  frame[0] = MAGIC;
-  frame[1] = VERSION;
+  frame[0] = HB_MAGIC;
+  frame[1] = HB_VERSION;
   frame[2] = kind;
   frame[3] = option;
   put16(frame + 4, sequence);
@@ -90,15 +87,15 @@ HbDevice::HbDevice(const HbSheet& sheet)
       fill_(0) {}
 
 bool HbDevice::receive(const uint8_t frame[HB_FRAME_BYTES], uint32_t now_us) {
-  if (frame[0] != MAGIC || get16(frame + CRC_AT) != hb_crc16(frame, CRC_AT)) {
+  if (frame[0] != HB_MAGIC || get16(frame + CRC_AT) != hb_crc16(frame, CRC_AT)) {
     is_damaged_ = true;
     return false;
   }
-  if (frame[1] != VERSION) return false;
-  if (frame[2] == ASK) {
+  if (frame[1] != HB_VERSION) return false;
+  if (frame[2] == HB_KIND_ASK) {
     asked_page_ = frame[3];
     asked_sequence_ = get16(frame + 4);
-  } else if (frame[2] == FORCE) {
+  } else if (frame[2] == HB_KIND_FORCE) {
     for (int i = 0; i < 7; i++) {
       if (!is_finite(float_bits(frame + 8 + 4 * i))) return false;
     }
@@ -110,7 +107,7 @@ bool HbDevice::receive(const uint8_t frame[HB_FRAME_BYTES], uint32_t now_us) {
     }
     command_.commanded.grip = get_float(frame + 32);
     echo_ = get16(frame + 4);
-    command_.is_enabled = (frame[3] & ENABLE) != 0;
+    command_.is_enabled = (frame[3] & HB_OPTION_ENABLE) != 0;
     command_.watchdog_us = 1000u * watchdog_ms;
     command_.received_us = now_us;
     command_.has_expired = false;
@@ -122,7 +119,7 @@ bool HbDevice::receive(const uint8_t frame[HB_FRAME_BYTES], uint32_t now_us) {
 }
 
 bool HbDevice::receive_byte(uint8_t byte, uint32_t now_us) {
-  if (fill_ == 0 && byte != MAGIC) {
+  if (fill_ == 0 && byte != HB_MAGIC) {
     is_damaged_ = true;
     return false;
   }
@@ -133,7 +130,7 @@ bool HbDevice::receive_byte(uint8_t byte, uint32_t now_us) {
     return true;
   }
   uint8_t next = 1;
-  while (next < HB_FRAME_BYTES && line_[next] != MAGIC) next++;
+  while (next < HB_FRAME_BYTES && line_[next] != HB_MAGIC) next++;
   fill_ = (uint8_t)(HB_FRAME_BYTES - next);
   memmove(line_, line_ + next, fill_);
   return false;
@@ -143,7 +140,7 @@ bool HbDevice::answer(uint8_t frame[HB_FRAME_BYTES]) {
   const int16_t page = asked_page_;
   asked_page_ = -1;
   if (page == 0) {
-    begin(frame, SHEET, 0, asked_sequence_);
+    begin(frame, HB_KIND_SHEET, 0, asked_sequence_);
     put16(frame + 6, sheet_.axes);
     const float numbers[] = {sheet_.rate,
                              sheet_.mass,
@@ -160,11 +157,11 @@ bool HbDevice::answer(uint8_t frame[HB_FRAME_BYTES]) {
       put_float(frame + 8 + 4 * i, numbers[i]);
     }
   } else if (page == 1) {
-    begin(frame, SHEET, 1, asked_sequence_);
+    begin(frame, HB_KIND_SHEET, 1, asked_sequence_);
     const size_t length = strlen(sheet_.name);
     memcpy(frame + 8, sheet_.name, length < HB_NAME_BYTES ? length : HB_NAME_BYTES);
   } else if (page == 2 && (sheet_.axes & HB_GRIP) != 0) {
-    begin(frame, SHEET, 2, asked_sequence_);
+    begin(frame, HB_KIND_SHEET, 2, asked_sequence_);
     const HbGrip& grip = *sheet_.grip;
     const float numbers[] = {grip.mass,        grip.damping,     grip.friction, grip.resolution,
                              grip.force_limit, grip.speed_limit, grip.travel};
@@ -185,7 +182,7 @@ void HbDevice::state(const HbMotion& motion, uint32_t now_us, uint8_t frame[HB_F
   if (command_.is_enabled) status |= HB_ENABLED;
   if (command_.has_expired) status |= HB_WATCHDOG;
   if (is_damaged_) status |= HB_DAMAGED;
-  begin(frame, STATE, status, ++sequence_);
+  begin(frame, HB_KIND_STATE, status, ++sequence_);
   put16(frame + 6, motion.buttons);
   put32(frame + 8, now_us);
   for (int i = 0; i < 3; i++) {

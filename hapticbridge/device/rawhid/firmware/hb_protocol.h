@@ -18,11 +18,9 @@
 #include <stddef.h>
 #include <stdint.h>
 
-static const size_t HB_FRAME_BYTES = 64;
-static const size_t HB_NAME_BYTES = 54;
+#include "hb_constants.h"
 
-// Longest watchdog in ms that a host may request.
-static const uint16_t HB_LONGEST_WATCHDOG_MS = 1000;
+static const size_t HB_NAME_BYTES = 54;
 
 // Axes, one bit each: along x, y, z and about them; and the grip between the fingers.
 enum HbAxis { HB_X = 1, HB_Y = 2, HB_Z = 4, HB_RX = 8, HB_RY = 16, HB_RZ = 32, HB_GRIP = 64 };

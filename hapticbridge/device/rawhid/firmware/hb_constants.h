@@ -1,0 +1,20 @@
+// Written by scripts/make_firmware_constants.py; do not edit.
+#ifndef HB_CONSTANTS_H
+#define HB_CONSTANTS_H
+
+static const int HB_FRAME_BYTES = 64;
+static const int HB_MAGIC = 72;
+static const int HB_VERSION = 1;
+static const int HB_LONGEST_WATCHDOG_MS = 1000;
+static const int HB_KIND_STATE = 83;
+static const int HB_KIND_SHEET = 68;
+static const int HB_KIND_FORCE = 70;
+static const int HB_KIND_ASK = 63;
+static const int HB_OPTION_ENABLE = 1;
+static const int HB_PLANES = 3;
+static const int HB_TRIALS = 8;
+static const float HB_NEAR = 0.999999f;
+static const float HB_SLOWEST = 0.25f;
+static const float HB_LONGEST = 3.0f;
+
+#endif

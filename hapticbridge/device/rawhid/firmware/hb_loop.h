@@ -1,0 +1,352 @@
+// Loop of a haptic device on its own board: it pulls at a tool that the host shows, at 4 to 20 kHz.
+// Plain C++11, this header alone: no Arduino, no heap, no exceptions.
+//
+//   HbLoop loop(1e-4f);                      // period T in s, kept by a timer's interrupt
+//   loop.show(shown);                        // when the host has shown its tool
+//   loop.tick(position, force);              // in the interrupt: position in m -> force in N
+//
+// In each period, with the handle at h, the tool shown at y, e = h - y, and all in the device's
+// frame, the force on the tool is
+//
+//   f = P_F(K e + B/T (dh - dy)),    P_F(u) = u min(1, F / |u|)
+//
+// and the device gets -f. The tool moves toward y*, where the host says that it is by now, only as
+// far as a tank pays for it:
+//
+//   D = E + sum P - W >= 0,    P = f . dy
+//
+// P in J is what the coupling gives to the tool in the period, W what the host's scene has taken of
+// it, and E a credit. The spring's energy V is convex in e, so the hand has put in at least
+// sum P + V on a device of b >= K T/2 + B, whatever the host shows, and however late. A period must
+// be computed within itself: the force belongs to the position that it was computed from.
+//
+// An HbLoop belongs to one interrupt. What a main loop receives for it is copied with interrupts off.
+//
+// Licence: Apache-2.0, as the rest of hapticbridge.
+#ifndef HB_LOOP_H
+#define HB_LOOP_H
+
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#include "hb_constants.h"
+
+// Energy in pJ: sums of it are exact, and need no unit for double precision.
+typedef int64_t HbEnergy;
+
+// Returns an energy in J in pJ, rounded down; up to 140 J. A conversion to 32 bits is one instruction.
+inline HbEnergy hb_picojoules(float joules) {
+  const float exact = 1e12f * joules;
+  const bool is_large = !(exact < 2e9f && exact > -2e9f);
+  float scaled = is_large ? exact * (1.0f / 65536.0f) : exact;
+  if (scaled > 2e9f) scaled = 2e9f;
+  if (scaled < -2e9f) scaled = -2e9f;
+  int32_t whole = (int32_t)scaled;
+  if ((float)whole > scaled) whole--;
+  return is_large ? (HbEnergy)whole * 65536 : (HbEnergy)whole;
+}
+
+// Returns an energy in pJ in J, rounded down, at least 0.
+inline float hb_joules(HbEnergy energy) {
+  if (energy <= 0) return 0.0f;
+  if (energy < 0x7FFFFFFF) return 0.999999e-12f * (float)(int32_t)energy;
+  const HbEnergy coarse = energy >> 16;
+  return 0.065535e-6f * (float)(int32_t)(coarse < 0x7FFFFFFF ? coarse : 0x7FFFFFFF);
+}
+
+// Gains of the coupling in the device's frame.
+struct HbGains {
+  float stiffness;  // K in N/m
+  float damping;    // B in N s/m
+  float level;      // F in N
+};
+
+// Surface near the tool: it stops the tool between two of its poses.
+struct HbPlane {
+  float normal[3];  // away from the surface, of length 1
+  float gap;        // m, from the surface to the tool as it was shown
+};
+
+// Tool as the host shows it.
+struct HbShown {
+  float position[3];  // m, in the device's frame
+  float velocity[3];  // m/s
+  HbEnergy work;      // W in pJ, all that the scene has taken so far
+  uint8_t planes;     // of plane
+  bool has_velocity;  // without one the tool is led to the position within the time between two
+  HbPlane plane[HB_PLANES];
+};
+
+// How the host wants the loop to be.
+struct HbSetting {
+  HbGains gains;
+  HbEnergy credit;  // E in pJ, given once, when the force first begins
+  float passing;    // energy in J that may be under way between two shows
+  float fade;       // s, in which the force rises, fades, and gains change
+  float patience;   // s without a show after which the force fades
+  bool is_enabled;  // false: the force fades
+};
+
+// What the loop tells of itself.
+struct HbReport {
+  HbEnergy passed;     // sum of P in pJ
+  HbEnergy tank;       // D in pJ
+  int64_t changes;     // sum of |w_k - w_(k-1)| over periods and axes in uN
+  uint32_t held_back;  // periods in which the tank was too low for y*
+  float position[3];   // h in m
+  float tool[3];       // y in m
+  float share;         // of the gains in force, 0 to 1
+  bool is_faulty;      // a position was not finite: no force until the board restarts
+};
+
+class HbLoop {
+ public:
+  // Creates a loop without a force; `period` is T in s.
+  explicit HbLoop(float period)
+      : period_(period), rate_(1.0f / period), share_(0.0f), has_started_(false), has_credit_(false) {
+    memset(&setting_, 0, sizeof setting_);
+    memset(&shown_, 0, sizeof shown_);
+    memset(&report_, 0, sizeof report_);
+    memset(velocity_, 0, sizeof velocity_);
+    memset(force_, 0, sizeof force_);
+    gains_ = setting_.gains;
+    scene_work_ = cap_ = 0;
+    age_ = silence_ = 0;
+    horizon_ = lead_ = 0.0f;
+    is_placed_ = false;
+    has_shown_ = false;
+  }
+
+  // Sets gains and times; the gains move there within `fade`.
+  void set(const HbSetting& setting) {
+    setting_ = setting;
+    note_cap();
+  }
+
+  // Shows the tool. `placed`: it was put there, and the force begins anew.
+  void show(const HbShown& shown, bool placed) {
+    const float since = fminf((float)(silence_ < 1 ? 1 : silence_) * period_, HB_SLOWEST);
+    report_.tank -= shown.work - scene_work_;
+    scene_work_ = shown.work;
+    shown_ = shown;
+    age_ = silence_ = 0;
+    is_placed_ = is_placed_ || placed || !has_shown_;
+    has_shown_ = true;
+    if (shown.has_velocity) {
+      copy(from_, shown.position);
+      copy(velocity_, shown.velocity);
+      horizon_ = HB_LONGEST * since;
+      lead_ = 0.0f;
+      return;
+    }
+    copy(from_, report_.tool);
+    for (int i = 0; i < 3; i++) velocity_[i] = (shown.position[i] - from_[i]) / since;
+    horizon_ = since;
+    lead_ = period_;
+  }
+
+  // Runs one period: `position` of the handle in m to `force` on the device in N.
+  void tick(const float position[3], float force[3]) {
+    float step[3], moved[3], u[3];
+    report_.is_faulty = report_.is_faulty || !is_finite(position);
+    if (report_.is_faulty) {
+      memset(force, 0, sizeof force_);
+      return;
+    }
+    if (!has_started_) {
+      copy(report_.position, position);
+      copy(report_.tool, position);
+      has_started_ = true;
+    }
+    subtract(position, report_.position, handle_step_);
+    copy(report_.position, position);
+    change_gains();
+    aim(step);
+    subtract(step, report_.tool, step);
+    float share = 1.0f;
+    const float least = -hb_joules(report_.tank);
+    float released = given(1.0f, step, moved, u);
+    if (released < least) {
+      report_.held_back++;
+      share = paid(step, released, least);
+      released = given(share, step, moved, u);
+      if (released < least) {  // by rounding
+        share = 0.0f;
+        released = given(share, step, moved, u);
+      }
+    }
+    float change = 0.0f;
+    for (int i = 0; i < 3; i++) {
+      report_.tool[i] += moved[i];
+      change += fabsf(-u[i] - force_[i]);
+      force[i] = force_[i] = -u[i];
+    }
+    report_.changes += (int32_t)(1e6f * change);
+    const HbEnergy passed = hb_picojoules(released);
+    report_.passed += passed;
+    report_.tank += passed;
+    if (age_ > 0 && report_.tank > cap_) report_.tank = cap_;
+    if (age_ < INT32_MAX) age_++;
+    if (silence_ < INT32_MAX) silence_++;
+  }
+
+  const HbReport& report() const { return report_; }
+
+ private:
+  static void copy(float to[3], const float from[3]) { memcpy(to, from, 3 * sizeof(float)); }
+
+  static void subtract(const float a[3], const float b[3], float result[3]) {
+    for (int i = 0; i < 3; i++) result[i] = a[i] - b[i];
+  }
+
+  static float dot(const float a[3], const float b[3]) {
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+  }
+
+  // Tests the bits, so that it holds under -ffast-math too.
+  static bool is_finite(const float vector[3]) {
+    uint32_t bits[3];
+    memcpy(bits, vector, sizeof bits);
+    for (int i = 0; i < 3; i++) {
+      if ((bits[i] & 0x7F800000u) == 0x7F800000u) return false;
+    }
+    return true;
+  }
+
+  // Energy of the spring in J at a length in m.
+  static float energy(const HbGains& gains, float length) {
+    const float full = gains.stiffness * length;
+    if (full <= gains.level) return 0.5f * full * length;
+    const float elastic = gains.level / gains.stiffness;
+    return gains.level * (length - 0.5f * elastic);
+  }
+
+  // Length in m at which the spring holds an energy in J.
+  static float length_of(const HbGains& gains, float energy) {
+    if (gains.stiffness <= 0.0f || gains.level <= 0.0f) return 0.0f;
+    const float elastic = 0.5f * gains.level * gains.level / gains.stiffness;
+    if (energy <= elastic) return sqrtf(2.0f * energy / gains.stiffness);
+    return gains.level / gains.stiffness + (energy - elastic) / gains.level;
+  }
+
+  // Moves the gains on; where their spring would gain energy, the shown tool slips to the handle.
+  void change_gains() {
+    const bool is_on = setting_.is_enabled && has_shown_ && !is_placed_ &&
+                       (float)silence_ * period_ <= setting_.patience;
+    const float pace = setting_.fade > period_ ? period_ / setting_.fade : 1.0f;
+    if (is_on && !has_credit_) {
+      report_.tank += setting_.credit;
+      has_credit_ = true;
+    }
+    share_ = is_on ? fminf(share_ + pace, 1.0f) : fmaxf(share_ - pace, 0.0f);
+    if (is_placed_ && share_ == 0.0f) is_placed_ = false;
+    const HbGains before = gains_;
+    approach(gains_.stiffness, share_ * setting_.gains.stiffness, pace, setting_.gains.stiffness);
+    approach(gains_.damping, share_ * setting_.gains.damping, pace, setting_.gains.damping);
+    approach(gains_.level, share_ * setting_.gains.level, pace, setting_.gains.level);
+    report_.share = share_;
+    if (memcmp(&gains_, &before, sizeof before) == 0) return;
+    note_cap();
+    if (gains_.stiffness <= before.stiffness && gains_.level <= before.level) return;
+    float stretch[3];
+    subtract(report_.position, report_.tool, stretch);
+    const float length = sqrtf(dot(stretch, stretch));
+    const float held = energy(before, length);
+    if (length <= 0.0f || energy(gains_, length) <= held) return;
+    const float kept = length_of(gains_, held) / length;
+    for (int i = 0; i < 3; i++) report_.tool[i] = report_.position[i] - kept * stretch[i];
+  }
+
+  // The tank holds twice what the spring has at its level, F^2/2K, and what is under way.
+  void note_cap() {
+    const float held_at_level =
+        gains_.stiffness > 0.0f ? gains_.level * gains_.level / gains_.stiffness : 0.0f;
+    cap_ = hb_picojoules(held_at_level + setting_.passing);
+  }
+
+  static void approach(float& value, float goal, float pace, float whole) {
+    const float most = pace * fmaxf(whole, value);
+    value += fmaxf(fminf(goal - value, most), -most);
+  }
+
+  // Finds y*: where the tool is by now, moved out of the planes.
+  void aim(float goal[3]) const {
+    if (!has_shown_) {
+      copy(goal, report_.tool);
+      return;
+    }
+    const float time = fminf((float)age_ * period_ + lead_, horizon_);
+    for (int i = 0; i < 3; i++) goal[i] = from_[i] + time * velocity_[i];
+    for (int round = 0; round < 4; round++) {
+      bool has_moved = false;
+      for (int k = 0; k < shown_.planes; k++) {
+        const HbPlane& plane = shown_.plane[k];
+        float moved[3];
+        subtract(goal, shown_.position, moved);
+        const float inside = -plane.gap - dot(plane.normal, moved);
+        if (inside <= 0.0f) continue;
+        for (int i = 0; i < 3; i++) goal[i] += inside * plane.normal[i];
+        has_moved = true;
+      }
+      if (!has_moved) return;
+    }
+  }
+
+  // Returns P in J if the tool moves by a share of a step; `u` is f in N, `moved` the motion in m as
+  // it is rounded.
+  float given(float share, const float step[3], float moved[3], float u[3]) const {
+    const float damped = gains_.damping * rate_;
+    for (int i = 0; i < 3; i++) {
+      const float tool = report_.tool[i] + share * step[i];
+      moved[i] = tool - report_.tool[i];
+      u[i] = gains_.stiffness * (report_.position[i] - tool) + damped * (handle_step_[i] - moved[i]);
+    }
+    const float size = sqrtf(dot(u, u));
+    if (size > gains_.level) {
+      const float ratio = gains_.level / size;
+      for (int i = 0; i < 3; i++) u[i] *= ratio;
+    }
+    return dot(u, moved);
+  }
+
+  // Returns a share of the step for which the tank pays. Below the level P is a parabola of the
+  // share, a r - c r^2; elsewhere smaller shares are tried.
+  float paid(const float step[3], float last_given, float least) const {
+    float moved[3], u[3], share = 0.0f, high = 1.0f, last = 1.0f, trial = 0.5f;
+    for (int k = 0; k < HB_TRIALS; k++) {
+      const float released = given(trial, step, moved, u);
+      if (released < least) {
+        high = trial;
+      } else {
+        share = trial;
+      }
+      const float curve = (released / trial - last_given / last) / (last - trial);
+      const float slope = released / trial + curve * trial;
+      last = trial;
+      last_given = released;
+      trial = share == 0.0f ? high / 16.0f : 0.5f * (share + high);
+      if (curve > 0.0f) {
+        const float inner = fmaxf(slope * slope - 4.0f * curve * least, 0.0f);
+        const float root = HB_NEAR * (slope + sqrtf(inner)) / (2.0f * curve);
+        if (share > 0.0f && fabsf(root - share) <= (1.0f - HB_NEAR) * share) break;
+        if (share < root && root < high) trial = root;
+      }
+      if (trial == last) break;
+    }
+    return share;
+  }
+
+  const float period_, rate_;
+  HbSetting setting_;
+  HbGains gains_;
+  HbShown shown_;
+  HbReport report_;
+  HbEnergy scene_work_, cap_;
+  float from_[3], velocity_[3], handle_step_[3], force_[3];
+  float horizon_, lead_, share_;
+  int32_t age_, silence_;
+  bool has_started_, has_credit_, has_shown_, is_placed_;
+};
+
+#endif

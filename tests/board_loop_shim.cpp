@@ -1,0 +1,189 @@
+// C entry points to the loop on the board, for ctypes; and a hand that tries to gain energy from it.
+#include <random>
+#include <vector>
+
+#include "hb_loop.h"
+
+namespace {
+
+HbSetting setting_of(const float* numbers, int is_enabled) {
+  HbSetting setting;
+  setting.gains.stiffness = numbers[0];
+  setting.gains.damping = numbers[1];
+  setting.gains.level = numbers[2];
+  setting.credit = (HbEnergy)(1e12 * numbers[3]);
+  setting.passing = numbers[4];
+  setting.fade = numbers[5];
+  setting.patience = numbers[6];
+  setting.is_enabled = is_enabled != 0;
+  return setting;
+}
+
+struct Message {
+  long due;
+  int kind;  // 0: shown, 1: setting
+  bool placed;
+  HbShown shown;
+  HbSetting setting;
+};
+
+}  // namespace
+
+extern "C" {
+
+HbLoop* loop_new(float period) { return new HbLoop(period); }
+
+void loop_delete(HbLoop* loop) { delete loop; }
+
+void loop_set(HbLoop* loop, const float* numbers, int is_enabled) {
+  loop->set(setting_of(numbers, is_enabled));
+}
+
+void loop_show(HbLoop* loop, const float* numbers, double work, int planes, int has_velocity,
+               int placed) {
+  HbShown shown;
+  memset(&shown, 0, sizeof shown);
+  memcpy(shown.position, numbers, 12);
+  memcpy(shown.velocity, numbers + 3, 12);
+  shown.work = (HbEnergy)(1e12 * work);
+  shown.planes = (uint8_t)planes;
+  shown.has_velocity = has_velocity != 0;
+  for (int k = 0; k < planes; k++) {
+    memcpy(shown.plane[k].normal, numbers + 6 + 4 * k, 12);
+    shown.plane[k].gap = numbers[9 + 4 * k];
+  }
+  loop->show(shown, placed != 0);
+}
+
+void loop_tick(HbLoop* loop, const float* position, float* force) { loop->tick(position, force); }
+
+void loop_report(const HbLoop* loop, double* works, float* poses) {
+  const HbReport& report = loop->report();
+  works[0] = 1e-12 * (double)report.passed;
+  works[1] = 1e-12 * (double)report.tank;
+  works[2] = 1e-6 * (double)report.changes;
+  works[3] = report.held_back;
+  works[4] = report.share;
+  memcpy(poses, report.position, 12);
+  memcpy(poses + 3, report.tool, 12);
+}
+
+// Lets a hand move a device of damping b = K T/2 + B, in each period at a constant velocity, while a
+// host shows anything, late, out of order or not at all, changes gains and credit's use, and either
+// restarts. Returns the most energy in J that the hand has gained beyond what blur may give:
+//
+//   sum f . dh - (b/T) |dh|^2 - (step/2) sum |df|
+//
+// numbers: T, K, B, F, E, step of the encoder, share of b that the device has, 1 to trust each show
+double attack(unsigned seed, const double* numbers, long ticks) {
+  std::mt19937 rng(seed);
+  std::normal_distribution<double> normal;
+  std::uniform_real_distribution<double> uniform;
+  const double period = numbers[0], step = numbers[5];
+  const float strongest[3] = {(float)numbers[1], (float)numbers[2], (float)numbers[3]};
+  const double b = numbers[6] * (numbers[1] * period / 2.0 + numbers[2]);
+  float choice[7] = {strongest[0], strongest[1], strongest[2], (float)numbers[4], 0.0f,
+                     (float)(period * (1.0 + 50.0 * uniform(rng))), 0.05f};
+  if (numbers[7] > 0.0) choice[3] = choice[4] = 1e3f;
+  HbLoop* loop = new HbLoop((float)period);
+  loop->set(setting_of(choice, 1));
+  double hand[3] = {0.0, 0.0, 0.0}, velocity[3] = {0.0, 0.0, 0.0}, gained = 0.0, most = 0.0;
+  double work = 0.0, changes = 0.0;
+  float force[3] = {0.0f, 0.0f, 0.0f}, last[3] = {0.0f, 0.0f, 0.0f};
+  std::vector<Message> waiting;
+  const int kind = (int)(uniform(rng) * 4.0), program = (int)(uniform(rng) * 4.0);
+  const double size = std::pow(10.0, -4.5 + 3.0 * uniform(rng));
+  const double interval = std::pow(10.0, 3.0 * uniform(rng)), late = 100.0 * uniform(rng);
+  long due = 0, turn = 0;
+  double direction = 1.0;
+  for (long tick = 0; tick < ticks; tick++) {
+    if (tick >= turn) {
+      turn = tick + (long)(std::pow(10.0, 1.0 + 2.5 * uniform(rng)));
+      direction = uniform(rng) < 0.5 ? -1.0 : 1.0;
+    }
+    for (int i = 0; i < 3; i++) {
+      double move = 0.0;
+      const double best = force[i] * period / (2.0 * b);
+      if (kind == 0) {
+        move = best * uniform(rng) * 2.0;  // gives way
+      } else if (kind == 1) {
+        velocity[i] += 0.3 * normal(rng) - 0.05 * velocity[i];
+        move = 1e-2 * size * velocity[i];
+      } else if (direction > 0.0) {
+        move = best;
+      } else {
+        move = kind == 2 ? -0.5 * best : 1e-2 * size * (i == 0 ? 1.0 : normal(rng));
+      }
+      hand[i] += move;
+      gained += force[i] * move - b / period * move * move;
+    }
+    most = std::max(most, gained - 0.5 * step * changes);
+    if (tick >= due) {
+      due = tick + 1 + (long)(interval * 2.0 * uniform(rng));
+      Message message;
+      memset(&message, 0, sizeof message);
+      message.due = tick + (long)(late * uniform(rng));
+      message.kind = uniform(rng) < 0.1;
+      message.placed = uniform(rng) < 0.02;
+      if (message.kind == 1) {
+        for (int k = 0; k < 3; k++) choice[k] = strongest[k] * (float)uniform(rng);
+        message.setting = setting_of(choice, uniform(rng) < 0.8);
+      }
+      HbShown& shown = message.shown;
+      shown.has_velocity = uniform(rng) < 0.5;
+      for (int i = 0; i < 3; i++) {
+        const double place = program == 0   ? hand[i] + size * normal(rng)
+                             : program == 1 ? hand[i] - direction * size
+                             : program == 2 ? 10.0 * size * normal(rng)
+                                            : hand[i] + size * direction * (i == 0);
+        shown.position[i] = (float)place;
+        shown.velocity[i] = (float)(normal(rng) * size * 100.0);
+      }
+      if (program != 1) work = std::max(0.0, work + 1e-5 * normal(rng));
+      shown.work = (HbEnergy)(1e12 * work);
+      shown.planes = (uint8_t)(uniform(rng) * (HB_PLANES + 1));
+      for (int k = 0; k < shown.planes; k++) {
+        HbPlane& plane = shown.plane[k];
+        double norm = 0.0;
+        for (int i = 0; i < 3; i++) {
+          plane.normal[i] = (float)normal(rng);
+          norm += plane.normal[i] * plane.normal[i];
+        }
+        for (int i = 0; i < 3; i++) plane.normal[i] /= (float)std::sqrt(norm);
+        plane.gap = (float)(size * uniform(rng));
+      }
+      if (uniform(rng) > 0.2) waiting.push_back(message);  // or it is lost
+    }
+    for (size_t k = 0; k < waiting.size();) {
+      if (waiting[k].due > tick) {
+        k++;
+        continue;
+      }
+      if (waiting[k].kind == 1) {
+        loop->set(waiting[k].setting);
+      } else {
+        loop->show(waiting[k].shown, waiting[k].placed);
+      }
+      waiting.erase(waiting.begin() + (long)k);
+    }
+    if (uniform(rng) < 1e-4) {  // the board restarts
+      delete loop;
+      loop = new HbLoop((float)period);
+      loop->set(setting_of(choice, 1));
+      most = std::max(most, gained - 0.5 * step * changes);
+      gained -= numbers[4];  // a credit of its own
+    }
+    float position[3];
+    for (int i = 0; i < 3; i++) {
+      position[i] = (float)(step > 0.0 ? step * std::round(hand[i] / step) : hand[i]);
+    }
+    loop->tick(position, force);
+    for (int i = 0; i < 3; i++) {
+      changes += std::fabs(force[i] - last[i]);
+      last[i] = force[i];
+    }
+  }
+  delete loop;
+  return most;
+}
+}

@@ -1,0 +1,330 @@
+"""The loop on a device's own board: its law, its account under attack, and its instructions."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from firmware_build import COMPILER, FIRMWARE
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import method_named, prepare
+from hapticbridge.device.rawhid.protocol import PLANES
+from hapticbridge.kernel.parameters import GuardParameters, RunParameters
+from hapticbridge.kernel.record import POST_DTYPE, SAMPLE_DTYPE
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import posted_tick
+from hapticbridge.run.endpoint import posted_scene
+
+HERE = Path(__file__).parent
+FLAGS = ("-std=c++11", "-Wall", "-Wextra", "-Werror", "-O2", "-ffp-contract=off", f"-I{FIRMWARE}")
+
+PERIOD, STIFFNESS, DAMPING, LEVEL, CREDIT = 1e-4, 20e3, 0.5, 5.0, 0.01
+TICKS = 10_000
+
+pytestmark = pytest.mark.skipif(
+    COMPILER is None, reason="neither g++ nor clang++ is here to compile the firmware with"
+)
+
+
+@pytest.fixture(scope="module", name="library")
+def _library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    target = tmp_path_factory.mktemp("board") / "loop.so"
+    source = str(HERE / "board_loop_shim.cpp")
+    subprocess.run(
+        [str(COMPILER), *FLAGS, "-shared", "-fPIC", source, "-o", str(target)], check=True
+    )
+    library = ctypes.CDLL(str(target))
+    library.loop_new.restype, library.loop_new.argtypes = ctypes.c_void_p, [ctypes.c_float]
+    library.attack.restype = ctypes.c_double
+    return library
+
+
+def floats(values: Any) -> Any:
+    return np.asarray(values, np.float32).ctypes.data_as(ctypes.POINTER(ctypes.c_float))
+
+
+class Loop:
+    """The firmware's loop.
+
+    Attributes:
+        passed, tank: Σ P and D in J.
+        share: Share of the gains in force.
+        tool: Position of the shown tool in m.
+    """
+
+    def __init__(self, library: ctypes.CDLL, period: float = PERIOD, **changes: float) -> None:
+        self._library = library
+        self._loop = ctypes.c_void_p(library.loop_new(period))
+        self._setting: dict[str, float] = {
+            "stiffness": STIFFNESS,
+            "damping": DAMPING,
+            "level": LEVEL,
+            "credit": CREDIT,
+            "passing": 0.0,
+            "fade": period,
+            "patience": 1e3,
+        }
+        self._setting |= changes
+        self.set()
+        self.tool, self.passed, self.tank, self.share = np.zeros(3), 0.0, 0.0, 0.0
+
+    def set(self, *, is_enabled: bool = True, **changes: float) -> None:
+        self._setting |= changes
+        self._library.loop_set(self._loop, floats(list(self._setting.values())), int(is_enabled))
+
+    def show(self, position: Any, velocity: Any = None, **others: Any) -> None:
+        """Shows the tool; ``surfaces`` are normals and gaps, ``work`` is W in J."""
+        numbers = np.zeros(6 + 4 * PLANES)
+        surfaces = others.get("surfaces", ())
+        numbers[:3], numbers[3:6] = position, 0.0 if velocity is None else velocity
+        for k, (normal, gap) in enumerate(surfaces):
+            numbers[6 + 4 * k : 10 + 4 * k] = *normal, gap
+        self._library.loop_show(
+            self._loop,
+            floats(numbers),
+            ctypes.c_double(others.get("work", 0.0)),
+            len(surfaces),
+            int(velocity is not None),
+            int(others.get("is_placed", False)),
+        )
+
+    def tick(self, position: Any) -> NDArray[np.float64]:
+        """Runs one period; returns the force on the device in N."""
+        force, works, poses = np.zeros(3, np.float32), np.zeros(5), np.zeros(6, np.float32)
+        self._library.loop_tick(self._loop, floats(position), floats(force))
+        doubles = works.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+        self._library.loop_report(self._loop, doubles, floats(poses))
+        self.passed, self.tank, _, _, self.share = works
+        self.tool = poses[3:].astype(np.float64)
+        return force.astype(np.float64)
+
+
+def test_the_constants_are_those_of_the_host() -> None:
+    script = HERE.parent / "scripts" / "make_firmware_constants.py"
+    subprocess.run([sys.executable, str(script), "--check"], check=True)
+
+
+# The law is that of the kernel
+
+
+def kernel() -> BoundKernel:
+    """The loop of another program's scene, at the board's period and gains."""
+    scene, method = posted_scene(CREDIT), method_named("implicit")
+    coupling = Coupling(STIFFNESS, DAMPING, 1e-6, 0.0)
+    prepare(scene, coupling, PERIOD, 1, method, warns=False)
+    start = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    return BoundKernel(
+        scene.model,
+        scene.data,
+        RunParameters(
+            grip=scene.grip,
+            period=PERIOD,
+            substeps=1,
+            coupling=method.law_coupling(coupling, PERIOD),
+            force_limit=LEVEL,
+            torque_limit=1.0,
+            ramp_ticks=1,
+            device_origin=start,
+            handle_origin=scene.grip_pose(),
+            device_start=start,
+            scheme=method.scheme,
+            scene_ticks=20,
+            credit=CREDIT,
+            guarding=GuardParameters(fade_ticks=1),
+        ),
+    )
+
+
+def shown_at_random(rng: np.random.Generator, hand: NDArray[np.float64]) -> NDArray[np.void]:
+    """Returns a tool near the hand, in numbers of single precision."""
+    post = np.zeros(1, POST_DTYPE)
+    count, has_velocity = int(rng.integers(PLANES + 1)), rng.random() < 0.5
+    normals = rng.standard_normal((PLANES, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    post["pose"][0, :3], post["pose"][0, 3] = hand + 3e-5 * rng.standard_normal(3), 1.0
+    post["has_velocity"], post["planes"] = has_velocity, count
+    post["velocity"][0, :3] = has_velocity * 0.05 * rng.standard_normal(3)
+    post["normals"][0, : 3 * PLANES] = normals.ravel()
+    post["gaps"][0, :PLANES] = np.abs(1e-5 * rng.standard_normal(PLANES))
+    for name in ("pose", "velocity", "normals", "gaps"):
+        post[name] = post[name].astype(np.float32)
+    return post
+
+
+def show(loop: Loop, post: NDArray[np.void]) -> None:
+    count, own = int(post["planes"][0]), post[0]
+    surfaces = [(own["normals"][3 * k : 3 * k + 3], own["gaps"][k]) for k in range(count)]
+    velocity = own["velocity"][:3] if own["has_velocity"] else None
+    loop.show(own["pose"][:3], velocity, surfaces=surfaces, work=float(own["work"]))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_each_period_is_that_of_the_kernel(library: ctypes.CDLL, seed: int) -> None:
+    rng, bound = np.random.default_rng(seed), kernel()
+    state, row, sample = bound.state, bound.row, np.zeros(1, SAMPLE_DTYPE)
+    sample["quaternion"][0, 0] = 1.0
+    loop = Loop(library, passing=float(state["shown"]["passing"][0]))
+    hand, velocity, due = np.zeros(3), np.zeros(3), 0
+    kinds, work = np.zeros(2, np.int64), 0.0
+    for tick in range(3000):
+        post = np.zeros(0, POST_DTYPE)
+        if tick > 5:
+            velocity += 0.02 * rng.standard_normal(3) - 0.01 * velocity
+            hand = (hand + PERIOD * velocity).astype(np.float32).astype(np.float64)
+            # one period from the same state: where the tank is nearly empty, paths differ by more
+            state["pose"]["tool_position"][0], state["shown"]["tank"] = loop.tool, loop.tank
+        if tick >= due:
+            due, post = tick + int(rng.integers(5, 40)), shown_at_random(rng, hand)
+            if tick == 0:
+                post["pose"][0, :3], post["has_velocity"], post["planes"] = 0.0, 0, 0
+            work += 1e-6 * rng.random() * (tick > 0)
+            post["work"] = work
+            show(loop, post)
+        sample["position"][0] = hand
+        held_back, before = int(state["shown"]["held_back"][0]), loop.passed
+        assert posted_tick(state, sample, post, row, PERIOD)
+        force = loop.tick(hand)
+        if tick <= 5:
+            continue
+        is_paid = int(state["shown"]["held_back"][0]) == held_back
+        kinds[int(is_paid)] += 1
+        given = float(state["shown"]["work"][0])
+        if is_paid:
+            assert force == pytest.approx(row["wrench_on_device"][0, :3], abs=1e-3)
+            assert loop.tool == pytest.approx(row["tool_position"][0], abs=5e-8)
+            assert loop.passed - before == pytest.approx(given, abs=LEVEL * 2e-8)
+        else:  # both search the largest motion that is paid for
+            assert loop.tank >= -1e-11 - max(work, 0.0)
+    assert kinds.min() > 100
+
+
+# The account: a hand that may choose every motion, and a host that shows anything
+
+
+def gained(library: ctypes.CDLL, seed: int, **changes: float) -> float:
+    """Returns the most energy in J that a hand gets beyond the credit and the encoder's blur."""
+    rng = np.random.default_rng(seed)
+    period, b, share = 10 ** rng.uniform(-4.3, -3.0), rng.uniform(0.5, 5.0), rng.uniform(0.2, 1.0)
+    stiffness, level = share * 2.0 * b / period, 10 ** rng.uniform(0.0, 1.2)
+    credit, step = 10 ** rng.uniform(-3.0, -1.0), rng.choice([0.0, 0.0, 1e-5, 5e-5])
+    chosen = {"step": step, "damping_share": 1.0, "trust": 0.0} | changes
+    numbers = (period, stiffness, b - 0.5 * stiffness * period, level, credit, *chosen.values())
+    values = (ctypes.c_double * len(numbers))(*numbers)
+    return float(library.attack(ctypes.c_uint(seed), values, ctypes.c_long(TICKS))) - credit
+
+
+def test_no_hand_gets_more_than_the_credit(library: ctypes.CDLL) -> None:
+    assert max(gained(library, seed) for seed in range(100)) < 1e-6
+
+
+@pytest.mark.parametrize("change", [{"trust": 1.0}, {"damping_share": 0.5, "step": 0.0}])
+def test_without_tank_or_damping_hands_are_seen_to_gain(
+    library: ctypes.CDLL, change: dict[str, float]
+) -> None:
+    assert max(gained(library, seed, **change) for seed in range(100)) > 0.01
+
+
+# Ends of the force
+
+
+def pressed(library: ctypes.CDLL, **changes: float) -> Loop:
+    """A loop whose hand presses 0.1 mm into a wall at 0."""
+    loop = Loop(library, **changes)
+    loop.show(np.zeros(3), np.zeros(3))
+    loop.tick(np.zeros(3))
+    for k in range(200):
+        force = loop.tick([-5e-7 * (k + 1), 0.0, 0.0])
+    assert force[0] == pytest.approx(1e-4 * changes.get("stiffness", STIFFNESS), rel=0.01)
+    return loop
+
+
+def test_a_silent_host_and_one_that_ends_the_force_let_it_fade(library: ctypes.CDLL) -> None:
+    for is_ended in (False, True):
+        loop = pressed(library, fade=20 * PERIOD, patience=200.5 * PERIOD)
+        if is_ended:
+            loop.set(is_enabled=False)
+        forces = [loop.tick([-1e-4, 0.0, 0.0])[0] for _ in range(30)]
+        assert np.all(np.diff(forces) <= 1e-6)
+        assert forces[-1] == 0.0
+        assert np.count_nonzero(forces) in (18, 19, 20)
+        if not is_ended:  # a word of the host lets it rise again, from where the hand is
+            loop.show(np.zeros(3), np.zeros(3))
+            assert abs(loop.tick([-1e-4, 0.0, 0.0])[0]) < 0.2
+
+
+def test_a_tool_that_was_put_elsewhere_ends_the_force_first(library: ctypes.CDLL) -> None:
+    loop = pressed(library, fade=20 * PERIOD)
+    loop.show([0.05, 0.0, 0.0], np.zeros(3), is_placed=True)
+    shares = []
+    for _ in range(45):
+        loop.tick([-1e-4, 0.0, 0.0])
+        shares.append(loop.share)
+    assert min(shares) == 0.0
+    assert shares[-1] == 1.0
+    assert loop.tank >= 0.0
+
+
+def test_a_position_that_is_no_number_ends_the_force_for_good(library: ctypes.CDLL) -> None:
+    for value in (np.nan, np.inf, -np.inf):
+        loop = pressed(library)
+        assert np.all(loop.tick([value, 0.0, 0.0]) == 0.0)
+        loop.show(np.zeros(3), np.zeros(3))
+        assert np.all(loop.tick([-1e-4, 0.0, 0.0]) == 0.0)
+
+
+def test_raised_gains_give_the_spring_no_energy(library: ctypes.CDLL) -> None:
+    loop = pressed(library, stiffness=STIFFNESS / 4.0, damping=0.0, passing=1e-3, fade=1e-3)
+    held = 0.5 * STIFFNESS / 4.0 * 1e-8
+    loop.set(stiffness=STIFFNESS)
+    for _ in range(20):
+        force = loop.tick([-1e-4, 0.0, 0.0])[0]
+        stretch = loop.tool[0] + 1e-4
+        # what the spring has more was paid: it is the tool that was led back
+        assert 0.5 * force * stretch <= held + 1e-12 - min(loop.passed, 0.0)
+
+
+# On the processors of boards
+
+CORES = {
+    "cortex-m7": ("fpv5-d16", "mps2-an500", "0", "0x20000000"),
+    "cortex-m33": ("fpv5-sp-d16", "mps2-an505", "0x10000000", "0x38000000"),
+}
+CROSS, EMULATOR = shutil.which("arm-none-eabi-g++"), shutil.which("qemu-system-arm")
+MOST = 2500
+"""Instructions of a period with three axes, of the 15 000 that 10 kHz leaves at 150 MHz."""
+
+
+def told(text: str) -> dict[str, int]:
+    return {name: int(value) for name, value in re.findall(r"^(.+) (\d+)$", text, re.MULTILINE)}
+
+
+@pytest.mark.skipif(
+    CROSS is None or EMULATOR is None,
+    reason="gcc-arm-none-eabi and qemu-system-arm are not installed",
+)
+@pytest.mark.parametrize("core", CORES)
+def test_a_board_computes_the_same_bits_in_time(core: str, tmp_path: Path) -> None:
+    fpu, board, code, data = CORES[core]
+    source, native, target = HERE / "board_loop_program.cpp", tmp_path / "native", tmp_path / core
+    subprocess.run([str(COMPILER), *FLAGS, str(source), "-o", str(native)], check=True)
+    own = ["-fno-exceptions", "-fno-rtti", "-fno-threadsafe-statics", "-nostartfiles"]
+    own += [f"-mcpu={core}", "-mthumb", "-mfloat-abi=hard", f"-mfpu={fpu}"]
+    own += ["-T", str(HERE / "board_loop.ld"), f"-Wl,--defsym=CODE={code}"]
+    own += [f"-Wl,--defsym=DATA={data}", str(source), "-o", str(target)]
+    subprocess.run([str(CROSS), *FLAGS, *own], check=True)
+    expected = subprocess.run([str(native)], check=True, capture_output=True, text=True).stdout
+    emulate = [str(EMULATOR), "-M", board, "-icount", "shift=0", "-nographic", "-kernel"]
+    emulate += [str(target), "-semihosting-config", "enable=on,target=native"]
+    done = subprocess.run(emulate, check=True, capture_output=True, text=True, timeout=120.0)
+    emulated = told(done.stdout + done.stderr)
+    assert emulated | told(expected) == emulated
+    assert 100 < emulated["instructions, mean"] < emulated["instructions, most"] <= MOST
