@@ -21,6 +21,9 @@ def header() -> str:
         "HB_LONGEST_WATCHDOG_MS": protocol.MAX_WATCHDOG_MS,
         **{f"HB_KIND_{kind.name}": int(kind) for kind in protocol.Kind},
         "HB_OPTION_ENABLE": protocol.ENABLE,
+        "HB_OPTION_HAS_VELOCITY": protocol.HAS_VELOCITY,
+        "HB_OPTION_IS_PLACED": protocol.IS_PLACED,
+        "HB_OPTION_PLANE": protocol.PLANE,
         "HB_PLANES": protocol.PLANES,
         "HB_TRIALS": shown_tool.TRIALS,
     }

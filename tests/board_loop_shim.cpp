@@ -2,7 +2,9 @@
 #include <random>
 #include <vector>
 
-#include "hb_loop.h"
+static void noInterrupts() {}
+static void interrupts() {}
+#include "hb_board.h"
 
 namespace {
 
@@ -66,6 +68,39 @@ void loop_report(const HbLoop* loop, double* works, float* poses) {
   works[4] = report.share;
   memcpy(poses, report.position, 12);
   memcpy(poses + 3, report.tool, 12);
+}
+
+// A whole board of 10 kHz, which a host knows by its frames alone.
+HbBoard* board_new() {
+  HbSheet sheet;
+  memset(&sheet, 0, sizeof sheet);
+  sheet.axes = HB_X | HB_Y | HB_Z;
+  sheet.rate = 1000.0f;
+  sheet.damping = 2.0f;
+  sheet.force_limit = sheet.speed_limit = 5.0f;
+  sheet.name = "board";
+  return new HbBoard(sheet, 1e-4f);
+}
+
+void board_delete(HbBoard* board) { delete board; }
+
+int board_receive(HbBoard* board, const unsigned char* frame, unsigned now_us) {
+  return board->receive(frame, now_us);
+}
+
+int board_answer(HbBoard* board, unsigned char* frame) { return board->answer(frame); }
+
+void board_state(HbBoard* board, const float* position, int status, unsigned now_us,
+                 unsigned char* frame) {
+  HbMotion motion;
+  memset(&motion, 0, sizeof motion);
+  memcpy(motion.position, position, 12);
+  motion.status = (uint8_t)status;
+  board->state(motion, now_us, frame);
+}
+
+void board_tick(HbBoard* board, const float* position, unsigned now_us, float* force) {
+  board->tick(position, now_us, force);
 }
 
 // Lets a hand move a device of damping b = K T/2 + B, in each period at a constant velocity, while a

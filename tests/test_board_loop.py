@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import re
 import shutil
 import subprocess
@@ -17,7 +18,19 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import method_named, prepare
-from hapticbridge.device.rawhid.protocol import PLANES
+from hapticbridge.device.rawhid.protocol import (
+    PLANES,
+    LoopReport,
+    LoopSetting,
+    LoopState,
+    ShownTool,
+    Status,
+    ask_frame,
+    decoded,
+    force_frame,
+    setting_frame,
+    show_frames,
+)
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
 from hapticbridge.kernel.record import POST_DTYPE, SAMPLE_DTYPE
 from hapticbridge.kernel.state import BoundKernel
@@ -39,10 +52,12 @@ pytestmark = pytest.mark.skipif(
 def _library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     target = tmp_path_factory.mktemp("board") / "loop.so"
     source = str(HERE / "board_loop_shim.cpp")
+    sources = [source, str(FIRMWARE / "hb_protocol.cpp")]
     subprocess.run(
-        [str(COMPILER), *FLAGS, "-shared", "-fPIC", source, "-o", str(target)], check=True
+        [str(COMPILER), *FLAGS, "-shared", "-fPIC", *sources, "-o", str(target)], check=True
     )
     library = ctypes.CDLL(str(target))
+    library.board_new.restype = ctypes.c_void_p
     library.loop_new.restype, library.loop_new.argtypes = ctypes.c_void_p, [ctypes.c_float]
     library.attack.restype = ctypes.c_double
     return library
@@ -290,6 +305,121 @@ def test_raised_gains_give_the_spring_no_energy(library: ctypes.CDLL) -> None:
         stretch = loop.tool[0] + 1e-4
         # what the spring has more was paid: it is the tool that was led back
         assert 0.5 * force * stretch <= held + 1e-12 - min(loop.passed, 0.0)
+
+
+# A whole board, by its frames
+
+
+class Board:
+    """A board in virtual time, whose handle is where ``position`` says."""
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self._library, self._board = library, ctypes.c_void_p(library.board_new())
+        self.position, self.force, self.now = np.zeros(3), np.zeros(3), 0
+        self.status = 0
+
+    def send(self, *frames: bytes) -> bool:
+        return all(self._library.board_receive(self._board, each, self.now) for each in frames)
+
+    def run(self, periods: int, pace_us: int = 100) -> None:
+        force = np.zeros(3, np.float32)
+        for _ in range(periods):
+            self.now += pace_us
+            self._library.board_tick(self._board, floats(self.position), self.now, floats(force))
+        self.force = force.astype(np.float64)
+
+    def state(self) -> Any:
+        frame = ctypes.create_string_buffer(64)
+        own = self._board, floats(self.position), self.status, self.now, frame
+        self._library.board_state(*own)
+        return decoded(frame.raw)
+
+    def numbers(self) -> Any:
+        frame = ctypes.create_string_buffer(64)
+        assert self.send(ask_frame(1, 0))
+        assert self._library.board_answer(self._board, frame)
+        return decoded(frame.raw)
+
+
+SETTING = LoopSetting(STIFFNESS, DAMPING, LEVEL, 0.0, 10 * PERIOD, 1e-3)
+WALL = (((1.0, 0.0, 0.0), 0.0), ((0.0, 1.0, 0.0), 2e-4), ((0.0, 0.0, 1.0), 0.5))
+
+
+def at_a_wall(library: ctypes.CDLL) -> Board:
+    """A board whose hand presses 50 µm into a wall along x."""
+    board = Board(library)
+    assert board.send(setting_frame(1, SETTING))
+    for sequence in range(2, 22):
+        board.position = np.array([-5e-5, 0.0, 0.0]) * (sequence - 2) / 19
+        assert board.send(*show_frames(sequence, ShownTool((0.0,) * 3, None, 0.0, WALL), 50))
+        board.run(10)
+    return board
+
+
+def test_a_board_says_that_it_has_a_loop_and_renders_a_wall(library: ctypes.CDLL) -> None:
+    board = at_a_wall(library)
+    assert board.numbers().loop_rate == 10e3
+    assert board.force == pytest.approx([1.0, 0.0, 0.0], rel=0.01)
+    states = [board.state() for _ in range(40)]
+    state, report = states[0], next(each for each in states if isinstance(each, LoopReport))
+    assert isinstance(state, LoopState)
+    assert state.force == pytest.approx(board.force)
+    assert (state.echo, state.status) == (21, Status.ENABLED)
+    assert state.tank == pytest.approx(1e-3 + state.passed, abs=1e-8)
+    assert report.share == 1.0
+    assert (report.ticks, report.missed) == (200, 0)
+    # the spring's force rises to 1 N, and the damper's rises and falls in each step of the hand
+    assert report.changes == pytest.approx(1.0 + 2.0 * DAMPING / PERIOD * 5e-5, rel=0.05)
+    # the second and third surface came in a frame of their own
+    tool = ShownTool((0.0,) * 3, (0.0, -1.0, -10.0), 1e-6, WALL)
+    board.send(*show_frames(22, tool, 50))
+    board.position = np.array([0.0, -2e-3, -2e-3])
+    board.run(10)
+    counters = next(each for each in (board.state() for _ in range(40)) if hasattr(each, "tool"))
+    assert counters.tool == pytest.approx((0.0, -2e-4, -1e-2), abs=1e-6) or counters.held_back
+    assert counters.work == pytest.approx(1e-6)
+
+
+def test_an_overtaken_or_damaged_tool_is_dropped(library: ctypes.CDLL) -> None:
+    board = at_a_wall(library)
+    for sequence in (21, 20, 65000):
+        assert not board.send(*show_frames(sequence, ShownTool((0.01, 0.0, 0.0)), 50))
+    assert not board.send(*show_frames(22, ShownTool((math.nan, 0.0, 0.0)), 50))
+    frame = bytearray(show_frames(22, ShownTool((0.01, 0.0, 0.0)), 50)[0])
+    frame[9] ^= 1
+    assert not board.send(bytes(frame))
+    assert not board.send(setting_frame(22, SETTING._replace(stiffness=math.inf)))
+    board.run(10)
+    assert board.force == pytest.approx([1.0, 0.0, 0.0], rel=0.01)
+
+
+def test_a_fault_a_force_frame_and_silence_end_the_loops_force(library: ctypes.CDLL) -> None:
+    for status in (Status.FAULT, Status.NOT_READY):
+        board = at_a_wall(library)
+        board.status = int(status)
+        assert board.state().status & status
+        board.run(1)
+        assert np.all(board.force == 0.0)
+        board.status = 0
+        board.state()
+        board.position = np.array([-0.01, 0.0, 0.0])  # stretched without a force
+        board.run(5)
+        assert np.all(board.force == 0.0)
+        board.send(*show_frames(22, ShownTool((0.0,) * 3), 50))
+        board.run(1)
+        assert np.linalg.norm(board.force) < 0.6  # and the spring begins where the hand is
+    board = at_a_wall(library)
+    board.send(force_frame(1, (0.5, 0.0, 0.0, 0.0, 0.0, 0.0), 20))
+    board.run(1)
+    assert board.force == pytest.approx([0.5, 0.0, 0.0])
+    board.run(200)
+    assert np.all(board.force == 0.0)
+    board = at_a_wall(library)
+    board.run(515)
+    assert np.all(board.force == 0.0)
+    board.run(3, pace_us=400)
+    counters = [board.state() for _ in range(40)]
+    assert max(each.missed for each in counters if isinstance(each, LoopReport)) == 9
 
 
 # On the processors of boards

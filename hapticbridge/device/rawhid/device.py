@@ -76,7 +76,8 @@ POLLING = 1e-3
 """Polling interval of a full-speed device in s, in each direction."""
 
 _MUST_SAY, _GRIP_MUST_SAY = ("rate", "speed_limit"), ("force_limit", "speed_limit")
-CHANGES = tuple(name for name in Numbers._fields if name not in ("axes", "rate", "delay"))
+_FIXED = ("axes", "rate", "delay", "loop_rate")
+CHANGES = tuple(name for name in Numbers._fields if name not in _FIXED)
 """Numbers of the data sheet that the user may replace."""
 GRIP_CHANGES = ("grip_mass", "grip_damping", "grip_force_limit")
 """Numbers of the grip axis that the user may replace."""
@@ -157,6 +158,7 @@ def data_sheet(
     if missing := [field for field in must if known[field] is None]:
         raise DeviceError(f"{name} does not report its {missing[0]}, which is required")
     delay = known.pop("delay")
+    known.pop("loop_rate")
     values: dict[str, Any] = {} if grip is None else grip.known() | of_grip
     if missing := [each for each in _GRIP_MUST_SAY if each in values and values[each] is None]:
         raise DeviceError(f"{name} does not report its grip's {missing[0]}, which is required")

@@ -38,14 +38,24 @@ class Kind(IntEnum):
     Attributes:
         STATE: From the device: its state.
         SHEET: From the device: a requested page of its data sheet.
+        LOOP: From the device: its state, while a loop of its own follows a shown tool.
+        REPORT: From the device: counters of that loop.
         FORCE: To the device: a wrench.
         ASK: To the device: request for a page of the sheet.
+        SETTING: To the device: gains of its loop.
+        PLANES: To the device: more surfaces for the next shown tool.
+        SHOW: To the device: a shown tool.
     """
 
     STATE = 0x53
     SHEET = 0x44
+    LOOP = 0x4C
+    REPORT = 0x52
     FORCE = 0x46
     ASK = 0x3F
+    SETTING = 0x47
+    PLANES = 0x50
+    SHOW = 0x59
 
 
 class Status(IntFlag):
@@ -69,7 +79,11 @@ class Status(IntFlag):
 
 
 ENABLE = 1
-"""Byte 3 of a force frame that enables the motors."""
+"""Byte 3 of a force frame, or of a shown tool, that enables the motors."""
+
+HAS_VELOCITY, IS_PLACED, PLANE = 2, 4, 16
+"""Byte 3 of a shown tool: its velocity is known, it was put there, and the factor of the number of
+surfaces."""
 
 PLANES = 3
 """Surfaces near the tool that a loop on the board takes with a pose."""
@@ -80,9 +94,16 @@ NUMBERS_PAGE, NAME_PAGE, GRIP_PAGE = 0, 1, 2
 _STATE = struct.Struct("<BBBBHHI12fH")
 _FORCE = struct.Struct("<BBBBHH7f26x")
 _GRIP = struct.Struct("<BBBBHH7f26x")
-_NUMBERS = struct.Struct("<BBBBHH11f10x")
+_NUMBERS = struct.Struct("<BBBBHH12f6x")
 _NAME = struct.Struct("<BBBBHH54s")
+_LOOP = struct.Struct("<BBBBHHI9fqfH")
+_REPORT = struct.Struct("<BBBBHH2q3I5f6x")
+_SETTING = struct.Struct("<BBBBHH5fq26x")
+_SHOW = struct.Struct("<BBBBHH6fq4f6x")
+_PLANES = struct.Struct("<BBBBHH8f22x")
 _CRC = struct.Struct("<H")
+
+_PICOJOULES, _MICRONEWTONS = 1e12, 1e6
 
 
 class State(NamedTuple):
@@ -137,6 +158,7 @@ class Numbers(NamedTuple):
         speed_limit: Largest speed in m/s.
         delay: Delay of the device itself in s: from latching a pose to sending it, plus from
             receiving a force to the motors.
+        loop_rate: Periods per second of a loop of its own; 0 without one.
     """
 
     axes: int
@@ -151,6 +173,7 @@ class Numbers(NamedTuple):
     torque_limit: float
     speed_limit: float
     delay: float
+    loop_rate: float = 0.0
 
     def known(self) -> dict[str, float | None]:
         """Returns the numbers by name, None for NaN and infinity."""
@@ -195,6 +218,96 @@ class GripNumbers(NamedTuple):
         return _known(self._asdict())
 
 
+class LoopState(NamedTuple):
+    """State of the device while its own loop follows a shown tool.
+
+    Attributes:
+        status, sequence, buttons, time_us, echo: As of ``State``; the echo is that of the newest
+            shown tool.
+        position, velocity, force: Handle in m and m/s and the force on it in N, in the device's
+            frame.
+        passed: Σ P, what the coupling has given to the shown tool, in J.
+        tank: D, what the shown tool may still give, in J.
+    """
+
+    status: int
+    sequence: int
+    buttons: int
+    time_us: int
+    position: tuple[float, ...]
+    velocity: tuple[float, ...]
+    force: tuple[float, ...]
+    passed: float
+    tank: float
+    echo: int
+
+
+class LoopReport(NamedTuple):
+    """Counters of the device's own loop.
+
+    Attributes:
+        sequence: That of the newest state.
+        changes: Σ |w_k − w_{k−1}| over periods and axes in N.
+        work: W of the newest shown tool in J.
+        held_back: Periods in which the tank was too low for the tool's motion.
+        ticks: Periods so far.
+        missed: Periods that the timer has missed.
+        share: Share of the gains in force, 0 to 1.
+        temperature: Temperature of the motors in °C; NaN if unknown.
+        tool: Position of the shown tool in m.
+    """
+
+    sequence: int
+    changes: float
+    work: float
+    held_back: int
+    ticks: int
+    missed: int
+    share: float
+    temperature: float
+    tool: tuple[float, ...]
+
+
+class ShownTool(NamedTuple):
+    """Tool as it is shown to a loop on the board, in the device's frame.
+
+    Attributes:
+        position: Its position in m.
+        velocity: Its velocity in m/s; None if it is not known.
+        work: W, all that the scene has taken so far, in J.
+        surfaces: At most ``PLANES`` surfaces near it: normal and gap in m.
+        is_placed: True if it was put there, and the force begins anew.
+        is_enabled: False ends the force.
+    """
+
+    position: tuple[float, ...]
+    velocity: tuple[float, ...] | None = None
+    work: float = 0.0
+    surfaces: tuple[tuple[tuple[float, ...], float], ...] = ()
+    is_placed: bool = False
+    is_enabled: bool = True
+
+
+class LoopSetting(NamedTuple):
+    """Coupling and times that a loop on the board has to render.
+
+    Attributes:
+        stiffness: K in N/m, in the device's frame.
+        damping: B' in N s/m.
+        level: Force level F in N.
+        passing: Energy in J that may be under way between two shown tools.
+        fade: Time in s in which the force rises and fades, and gains change.
+        credit: E in J, what the tool may give beyond what it got.
+    """
+
+    stiffness: float
+    damping: float
+    level: float
+    passing: float
+    fade: float
+    credit: float = 0.0
+
+
 def crc16(data: bytes) -> int:
     """Returns CRC-16/CCITT-FALSE: x^16 + x^12 + x^5 + 1, start 0xFFFF; 0x29B1 of "123456789"."""
     return crc_hqx(data, 0xFFFF)
@@ -217,6 +330,33 @@ def ask_frame(sequence: int, page: int) -> bytes:
     return _sealed(_FORCE.pack(MAGIC, VERSION, Kind.ASK, page, sequence, 0, *[0.0] * 7))
 
 
+def show_frames(sequence: int, shown: ShownTool, patience_ms: int) -> tuple[bytes, ...]:
+    """Returns the frames that show a tool; the force fades ``patience_ms`` after the last one."""
+    option = (
+        ENABLE * shown.is_enabled
+        + HAS_VELOCITY * (shown.velocity is not None)
+        + IS_PLACED * shown.is_placed
+        + PLANE * len(shown.surfaces)
+    )
+    planes = [number for normal, gap in shown.surfaces for number in (*normal, gap)]
+    planes += [0.0] * (4 * PLANES - len(planes))
+    velocity = shown.velocity or (0.0,) * 3
+    head = MAGIC, VERSION, Kind.SHOW, option, sequence, patience_ms
+    work = round(_PICOJOULES * shown.work)
+    frame = _sealed(_SHOW.pack(*head, *shown.position, *velocity, work, *planes[:4]))
+    if len(shown.surfaces) < 2:
+        return (frame,)
+    others = _PLANES.pack(MAGIC, VERSION, Kind.PLANES, 0, sequence, 0, *planes[4:])
+    return _sealed(others), frame
+
+
+def setting_frame(sequence: int, setting: LoopSetting) -> bytes:
+    """Returns the frame with the gains of a loop on the board."""
+    head = MAGIC, VERSION, Kind.SETTING, 0, sequence, 0
+    credit = round(_PICOJOULES * setting.credit)
+    return _sealed(_SETTING.pack(*head, *setting[:5], credit))
+
+
 def _sealed(body: bytes) -> bytes:
     return body + _CRC.pack(crc16(body))
 
@@ -229,23 +369,63 @@ def version_of(frame: bytes) -> int | None:
     return frame[1] if crc16(frame[:-2]) == crc else None
 
 
-def decoded(frame: bytes) -> State | Numbers | GripNumbers | str | None:
-    """Decodes any bytes from the device: a state, or a page of the sheet.
+Answer = State | LoopState | LoopReport | Numbers | GripNumbers | str
+"""Anything that a device sends."""
+
+
+def decoded(frame: bytes) -> Answer | None:
+    """Decodes any bytes from the device: a state, counters, or a page of the sheet.
 
     None stands for another length, version or kind, or a damaged frame. Numbers may be any float32.
     """
     if version_of(frame) != VERSION:
         return None
-    kind, page = frame[2], frame[3]
+    kind = frame[2]
     if kind == Kind.STATE:
         values = _STATE.unpack_from(frame)
         status, sequence, buttons, time_us = values[3:7]
         return State(status, sequence, buttons, time_us, values[7:19], values[19])
-    if kind == Kind.SHEET and page == NUMBERS_PAGE:
+    if kind == Kind.LOOP:
+        status, sequence, buttons, time_us, *numbers, passed, tank, echo = _LOOP.unpack_from(frame)[
+            3:
+        ]
+        return LoopState(
+            status,
+            sequence,
+            buttons,
+            time_us,
+            position=tuple(numbers[:3]),
+            velocity=tuple(numbers[3:6]),
+            force=tuple(numbers[6:]),
+            passed=passed / _PICOJOULES,
+            tank=tank,
+            echo=echo,
+        )
+    if kind == Kind.REPORT:
+        sequence, _, changes, work, held_back, ticks, missed, share, heat, *tool = (
+            _REPORT.unpack_from(frame)[4:]
+        )
+        return LoopReport(
+            sequence,
+            changes / _MICRONEWTONS,
+            work / _PICOJOULES,
+            held_back,
+            ticks,
+            missed,
+            share,
+            temperature=heat,
+            tool=tuple(tool),
+        )
+    return _page(frame) if kind == Kind.SHEET else None
+
+
+def _page(frame: bytes) -> Numbers | GripNumbers | str | None:
+    page = frame[3]
+    if page == NUMBERS_PAGE:
         return Numbers(*_NUMBERS.unpack_from(frame)[5:])
-    if kind == Kind.SHEET and page == GRIP_PAGE:
+    if page == GRIP_PAGE:
         return GripNumbers(*_GRIP.unpack_from(frame)[6:])
-    if kind == Kind.SHEET and page == NAME_PAGE:
+    if page == NAME_PAGE:
         return printable(_NAME.unpack_from(frame)[6].split(b"\0")[0].decode(errors="replace"))
     return None
 

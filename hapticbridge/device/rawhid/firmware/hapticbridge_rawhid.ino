@@ -2,7 +2,7 @@
 // drive (as on the Hapkit), a quadrature encoder on the motor, and a driver with a PWM and a
 // direction pin.
 //
-// Tools > USB Type > Raw HID. Files: this sketch, hb_constants.h, hb_protocol.h and hb_protocol.cpp in one folder.
+// Tools > USB Type > Raw HID. Files: this sketch, hb_constants.h, hb_loop.h, hb_protocol.h and hb_protocol.cpp in one folder.
 // Needs only Teensyduino (its Encoder library and IntervalTimer). Then, on the computer:
 //
 //   hapticbridge devices
@@ -59,6 +59,7 @@ HbSheet my_sheet() {
   sheet.torque_limit = NAN;  // it does not turn
   sheet.speed_limit = 2.0f;  // m/s, faster than a hand moves it
   sheet.delay = 1e-6f * CONTROL_PERIOD_US;
+  sheet.loop_rate = 0.0f;  // no loop of its own
   sheet.name = "one-axis capstan paddle";
   return sheet;
 }

@@ -2,7 +2,7 @@
 // magnetoresistive sensor, one motor on a capstan drive), or any Arduino or ESP32 with your own
 // three functions.
 //
-// Files: this sketch, hb_constants.h, hb_protocol.h and hb_protocol.cpp in one folder named hapticbridge_serial.
+// Files: this sketch, hb_constants.h, hb_loop.h, hb_protocol.h and hb_protocol.cpp in one folder named hapticbridge_serial.
 // Board: Arduino Uno (the Hapkit is one). Then, on the computer:
 //
 //   hapticbridge devices
@@ -67,6 +67,7 @@ HbSheet my_sheet() {
   sheet.torque_limit = NAN;  // it does not turn
   sheet.speed_limit = 2.0f;  // m/s, faster than a hand moves it
   sheet.delay = 1e-6f * CONTROL_PERIOD_US;
+  sheet.loop_rate = 0.0f;  // no loop of its own
   sheet.name = "Hapkit";
   return sheet;
 }

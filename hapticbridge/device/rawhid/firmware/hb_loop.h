@@ -96,8 +96,16 @@ struct HbReport {
   uint32_t held_back;  // periods in which the tank was too low for y*
   float position[3];   // h in m
   float tool[3];       // y in m
+  float force[3];      // on the device in N
   float share;         // of the gains in force, 0 to 1
   bool is_faulty;      // a position was not finite: no force until the board restarts
+};
+
+// How well the timer keeps the period.
+struct HbPace {
+  uint32_t ticks;     // periods so far
+  uint32_t missed;    // of them, those that came a period late or more
+  float temperature;  // degrees Celsius of the motors; NAN if unknown
 };
 
 class HbLoop {
@@ -109,7 +117,6 @@ class HbLoop {
     memset(&shown_, 0, sizeof shown_);
     memset(&report_, 0, sizeof report_);
     memset(velocity_, 0, sizeof velocity_);
-    memset(force_, 0, sizeof force_);
     gains_ = setting_.gains;
     scene_work_ = cap_ = 0;
     age_ = silence_ = 0;
@@ -121,7 +128,17 @@ class HbLoop {
   // Sets gains and times; the gains move there within `fade`.
   void set(const HbSetting& setting) {
     setting_ = setting;
-    note_cap();
+    // the tank holds twice what the spring has at its level, F^2/2K, and what is under way
+    const HbGains& gains = setting.gains;
+    const float held = gains.stiffness > 0.0f ? gains.level * gains.level / gains.stiffness : 0.0f;
+    cap_ = hb_picojoules(held + setting.passing);
+  }
+
+  // Ends the force at once, until a setting enables it again.
+  void end() {
+    setting_.is_enabled = false;
+    share_ = 0.0f;
+    memset(&gains_, 0, sizeof gains_);
   }
 
   // Shows the tool. `placed`: it was put there, and the force begins anew.
@@ -151,7 +168,8 @@ class HbLoop {
     float step[3], moved[3], u[3];
     report_.is_faulty = report_.is_faulty || !is_finite(position);
     if (report_.is_faulty) {
-      memset(force, 0, sizeof force_);
+      memset(force, 0, 3 * sizeof(float));
+      memset(report_.force, 0, sizeof report_.force);
       return;
     }
     if (!has_started_) {
@@ -179,8 +197,8 @@ class HbLoop {
     float change = 0.0f;
     for (int i = 0; i < 3; i++) {
       report_.tool[i] += moved[i];
-      change += fabsf(-u[i] - force_[i]);
-      force[i] = force_[i] = -u[i];
+      change += fabsf(-u[i] - report_.force[i]);
+      force[i] = report_.force[i] = -u[i];
     }
     report_.changes += (int32_t)(1e6f * change);
     const HbEnergy passed = hb_picojoules(released);
@@ -246,8 +264,6 @@ class HbLoop {
     approach(gains_.damping, share_ * setting_.gains.damping, pace, setting_.gains.damping);
     approach(gains_.level, share_ * setting_.gains.level, pace, setting_.gains.level);
     report_.share = share_;
-    if (memcmp(&gains_, &before, sizeof before) == 0) return;
-    note_cap();
     if (gains_.stiffness <= before.stiffness && gains_.level <= before.level) return;
     float stretch[3];
     subtract(report_.position, report_.tool, stretch);
@@ -256,13 +272,6 @@ class HbLoop {
     if (length <= 0.0f || energy(gains_, length) <= held) return;
     const float kept = length_of(gains_, held) / length;
     for (int i = 0; i < 3; i++) report_.tool[i] = report_.position[i] - kept * stretch[i];
-  }
-
-  // The tank holds twice what the spring has at its level, F^2/2K, and what is under way.
-  void note_cap() {
-    const float held_at_level =
-        gains_.stiffness > 0.0f ? gains_.level * gains_.level / gains_.stiffness : 0.0f;
-    cap_ = hb_picojoules(held_at_level + setting_.passing);
   }
 
   static void approach(float& value, float goal, float pace, float whole) {
@@ -343,7 +352,7 @@ class HbLoop {
   HbShown shown_;
   HbReport report_;
   HbEnergy scene_work_, cap_;
-  float from_[3], velocity_[3], handle_step_[3], force_[3];
+  float from_[3], velocity_[3], handle_step_[3];
   float horizon_, lead_, share_;
   int32_t age_, silence_;
   bool has_started_, has_credit_, has_shown_, is_placed_;

@@ -31,11 +31,32 @@ uint32_t float_bits(const uint8_t* at) { return get16(at) | (uint32_t)get16(at +
 
 bool is_finite(uint32_t bits) { return (bits & 0x7F800000u) != 0x7F800000u; }
 
+void put_energy(uint8_t* at, HbEnergy value) {
+  put32(at, (uint32_t)value);
+  put32(at + 4, (uint32_t)((uint64_t)value >> 32));
+}
+
+HbEnergy get_energy(const uint8_t* at) {
+  return (HbEnergy)(float_bits(at) | (uint64_t)float_bits(at + 4) << 32);
+}
+
+bool are_finite(const uint8_t* at, int count) {
+  for (int i = 0; i < count; i++) {
+    if (!is_finite(float_bits(at + 4 * i))) return false;
+  }
+  return true;
+}
+
 float get_float(const uint8_t* at) {
   uint32_t bits = float_bits(at);
   float value;
   memcpy(&value, &bits, 4);
   return value;
+}
+
+void get_plane(const uint8_t* at, HbPlane& plane) {
+  for (int i = 0; i < 3; i++) plane.normal[i] = get_float(at + 4 * i);
+  plane.gap = get_float(at + 12);
 }
 
 void begin(uint8_t* frame, uint8_t kind, uint8_t option, uint16_t sequence) {
@@ -79,26 +100,29 @@ HbWrench HbCommand::wrench(uint32_t now_us) {
 
 HbDevice::HbDevice(const HbSheet& sheet)
     : sheet_(sheet),
+      is_loop_(false),
+      planes_sequence_(0),
       sequence_(0),
       echo_(0),
       asked_sequence_(0),
       asked_page_(-1),
       is_damaged_(false),
-      fill_(0) {}
+      fill_(0) {
+  memset(&order_, 0, sizeof order_);
+}
 
 bool HbDevice::receive(const uint8_t frame[HB_FRAME_BYTES], uint32_t now_us) {
   if (frame[0] != HB_MAGIC || get16(frame + CRC_AT) != hb_crc16(frame, CRC_AT)) {
     is_damaged_ = true;
     return false;
   }
+  order_.kind = HbOrder::NONE;
   if (frame[1] != HB_VERSION) return false;
   if (frame[2] == HB_KIND_ASK) {
     asked_page_ = frame[3];
     asked_sequence_ = get16(frame + 4);
   } else if (frame[2] == HB_KIND_FORCE) {
-    for (int i = 0; i < 7; i++) {
-      if (!is_finite(float_bits(frame + 8 + 4 * i))) return false;
-    }
+    if (!are_finite(frame + 8, 7)) return false;
     uint16_t watchdog_ms = get16(frame + 6);
     if (watchdog_ms > HB_LONGEST_WATCHDOG_MS) watchdog_ms = HB_LONGEST_WATCHDOG_MS;
     for (int i = 0; i < 3; i++) {
@@ -111,7 +135,8 @@ bool HbDevice::receive(const uint8_t frame[HB_FRAME_BYTES], uint32_t now_us) {
     command_.watchdog_us = 1000u * watchdog_ms;
     command_.received_us = now_us;
     command_.has_expired = false;
-  } else {
+    is_loop_ = false;
+  } else if (!take_order(frame)) {
     return false;
   }
   is_damaged_ = false;
@@ -152,7 +177,8 @@ bool HbDevice::answer(uint8_t frame[HB_FRAME_BYTES]) {
                              sheet_.force_limit,
                              sheet_.torque_limit,
                              sheet_.speed_limit,
-                             sheet_.delay};
+                             sheet_.delay,
+                             sheet_.loop_rate};
     for (size_t i = 0; i < sizeof numbers / sizeof *numbers; i++) {
       put_float(frame + 8 + 4 * i, numbers[i]);
     }
@@ -175,18 +201,101 @@ bool HbDevice::answer(uint8_t frame[HB_FRAME_BYTES]) {
   return true;
 }
 
-void HbDevice::state(const HbMotion& motion, uint32_t now_us, uint8_t frame[HB_FRAME_BYTES]) {
+// Takes a frame for a loop on the board; returns false for another one.
+bool HbDevice::take_order(const uint8_t frame[HB_FRAME_BYTES]) {
+  HbShown& shown = order_.shown;
+  const uint16_t sequence = get16(frame + 4);
+  if (frame[2] == HB_KIND_PLANES) {
+    if (!are_finite(frame + 8, 8)) return false;
+    for (int k = 1; k < HB_PLANES; k++) get_plane(frame + 16 * k - 8, shown.plane[k]);
+    planes_sequence_ = sequence;
+    return true;
+  }
+  if (frame[2] == HB_KIND_SHOW) {
+    if (!are_finite(frame + 8, 6) || !are_finite(frame + 40, 4)) return false;
+    if (is_loop_ && (int16_t)(sequence - echo_) <= 0) return false;  // overtaken
+    for (int i = 0; i < 3; i++) {
+      shown.position[i] = get_float(frame + 8 + 4 * i);
+      shown.velocity[i] = get_float(frame + 20 + 4 * i);
+    }
+    shown.work = get_energy(frame + 32);
+    get_plane(frame + 40, shown.plane[0]);
+    shown.planes = frame[3] / HB_OPTION_PLANE;
+    const uint8_t known = planes_sequence_ == sequence ? HB_PLANES : 1;
+    if (shown.planes > known) shown.planes = known;
+    shown.has_velocity = (frame[3] & HB_OPTION_HAS_VELOCITY) != 0;
+    order_.is_placed = (frame[3] & HB_OPTION_IS_PLACED) != 0;
+    order_.setting.is_enabled = (frame[3] & HB_OPTION_ENABLE) != 0;
+    order_.setting.patience = 1e-3f * get16(frame + 6);
+    echo_ = sequence;
+    order_.kind = HbOrder::SHOW;
+  } else if (frame[2] == HB_KIND_SETTING) {
+    if (!are_finite(frame + 8, 5)) return false;
+    HbSetting& setting = order_.setting;
+    setting.gains.stiffness = get_float(frame + 8);
+    setting.gains.damping = get_float(frame + 12);
+    setting.gains.level = get_float(frame + 16);
+    setting.passing = get_float(frame + 20);
+    setting.fade = get_float(frame + 24);
+    setting.credit = get_energy(frame + 28);
+    order_.kind = HbOrder::SET;
+  } else {
+    return false;
+  }
+  if (!is_loop_) {
+    is_loop_ = true;
+    command_.is_enabled = false;
+    if (order_.kind == HbOrder::SET) echo_ = (uint16_t)(sequence - 1);
+  }
+  return true;
+}
+
+void HbDevice::begin_state(uint8_t kind, const HbMotion& motion, uint32_t now_us,
+                           uint8_t frame[HB_FRAME_BYTES]) {
   command_.is_unfit = (motion.status & (HB_FAULT | HB_NOT_READY)) != 0;
   wrench(now_us);  // updates command_.has_expired
   uint8_t status = motion.status & (HB_SATURATED | HB_FAULT | HB_NOT_READY);
-  if (command_.is_enabled) status |= HB_ENABLED;
-  if (command_.has_expired) status |= HB_WATCHDOG;
+  if (!is_loop_ && command_.is_enabled) status |= HB_ENABLED;
+  if (!is_loop_ && command_.has_expired) status |= HB_WATCHDOG;
   if (is_damaged_) status |= HB_DAMAGED;
-  begin(frame, HB_KIND_STATE, status, ++sequence_);
+  begin(frame, kind, status, ++sequence_);
   put16(frame + 6, motion.buttons);
   put32(frame + 8, now_us);
+  for (int i = 0; i < 3; i++) put_float(frame + 12 + 4 * i, motion.position[i]);
+  put16(frame + 60, echo_);
+}
+
+void HbDevice::loop_state(const HbMotion& motion, const HbReport& report, uint32_t now_us,
+                          uint8_t frame[HB_FRAME_BYTES]) {
+  begin_state(HB_KIND_LOOP, motion, now_us, frame);
+  if (report.share > 0.0f) frame[3] |= HB_ENABLED;
+  if (report.is_faulty) frame[3] |= HB_FAULT;
   for (int i = 0; i < 3; i++) {
-    put_float(frame + 12 + 4 * i, motion.position[i]);
+    put_float(frame + 24 + 4 * i, motion.velocity[i]);
+    put_float(frame + 36 + 4 * i, report.force[i]);
+  }
+  put_energy(frame + 48, report.passed);
+  put_float(frame + 56, 1e-12f * (float)report.tank);
+  seal(frame);
+}
+
+void HbDevice::loop_report(const HbReport& report, const HbPace& pace,
+                           uint8_t frame[HB_FRAME_BYTES]) {
+  begin(frame, HB_KIND_REPORT, 0, sequence_);
+  put_energy(frame + 8, report.changes);
+  put_energy(frame + 16, order_.shown.work);
+  put32(frame + 24, report.held_back);
+  put32(frame + 28, pace.ticks);
+  put32(frame + 32, pace.missed);
+  put_float(frame + 36, report.share);
+  put_float(frame + 40, pace.temperature);
+  for (int i = 0; i < 3; i++) put_float(frame + 44 + 4 * i, report.tool[i]);
+  seal(frame);
+}
+
+void HbDevice::state(const HbMotion& motion, uint32_t now_us, uint8_t frame[HB_FRAME_BYTES]) {
+  begin_state(HB_KIND_STATE, motion, now_us, frame);
+  for (int i = 0; i < 3; i++) {
     put_float(frame + 24 + 4 * i, motion.rotation[i]);
     put_float(frame + 36 + 4 * i, motion.velocity[i]);
     put_float(frame + 48 + 4 * i, motion.angular_velocity[i]);
@@ -196,6 +305,5 @@ void HbDevice::state(const HbMotion& motion, uint32_t now_us, uint8_t frame[HB_F
     put_float(frame + 52, motion.grip_speed);
     put_float(frame + 56, 0.0f);
   }
-  put16(frame + 60, echo_);
   seal(frame);
 }

@@ -19,6 +19,7 @@
 #include <stdint.h>
 
 #include "hb_constants.h"
+#include "hb_loop.h"
 
 static const size_t HB_NAME_BYTES = 54;
 
@@ -62,6 +63,7 @@ struct HbSheet {
   float torque_limit;        // N m, by norm
   float speed_limit;         // m/s
   float delay;               // s, latch of the pose to sending it, plus reception to motors
+  float loop_rate;           // Hz, periods of an HbLoop per second; 0 without one
   const char* name;          // UTF-8, at most HB_NAME_BYTES
   const HbGrip* grip;        // its grip axis; read only with HB_GRIP in axes
 };
@@ -104,6 +106,14 @@ struct HbCommand {
   HbWrench wrench(uint32_t now_us);
 };
 
+// What the host wants of a loop on the board.
+struct HbOrder {
+  enum Kind { NONE, SHOW, SET } kind;
+  HbShown shown;
+  bool is_placed;
+  HbSetting setting;
+};
+
 // CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, no reflection. "123456789" gives 0x29B1.
 uint16_t hb_crc16(const uint8_t* data, size_t count);
 
@@ -130,12 +140,32 @@ class HbDevice {
   // Command of the host; it changes with receive() and with state().
   const HbCommand& command() const { return command_; }
 
+  // Order for a loop in the frame that receive() has just taken; its kind is NONE for another frame.
+  const HbOrder& order() const { return order_; }
+
+  // True from the first order for a loop until the next force frame.
+  bool is_loop() const { return is_loop_; }
+
+  // As state(), of a loop: its force and account in place of the rotation.
+  void loop_state(const HbMotion& motion, const HbReport& report, uint32_t now_us,
+                  uint8_t frame[HB_FRAME_BYTES]);
+
+  // Fills in the frame with the counters of a loop.
+  void loop_report(const HbReport& report, const HbPace& pace, uint8_t frame[HB_FRAME_BYTES]);
+
   // Returns the present wrench, see HbCommand.
   HbWrench wrench(uint32_t now_us) { return command_.wrench(now_us); }
 
  private:
   HbSheet sheet_;
+  bool take_order(const uint8_t frame[HB_FRAME_BYTES]);
+  void begin_state(uint8_t kind, const HbMotion& motion, uint32_t now_us,
+                   uint8_t frame[HB_FRAME_BYTES]);
+
   HbCommand command_;
+  HbOrder order_;
+  bool is_loop_;
+  uint16_t planes_sequence_;
   uint16_t sequence_;
   uint16_t echo_;
   uint16_t asked_sequence_;

@@ -1,0 +1,126 @@
+// A device whose board runs the loop, and follows force frames where a host sends them instead.
+//
+//   HbBoard board(sheet, 1e-4f);             // sheet.loop_rate and T are set from each other
+//   void interrupt() {                       // every T, by a timer
+//     float x[3] = {0, 0, 0}, f[3];
+//     read_position(x);                      // m
+//     board.tick(x, micros(), f);
+//     write_force(f);                        // N
+//   }
+//   board.receive(frame, micros());          // as of HbDevice, in the main loop
+//   if (board.answer(frame)) send(frame);
+//   if (board.state(motion, micros(), frame)) send(frame);
+//
+// Define HB_LOCK and HB_UNLOCK before this file where noInterrupts() and interrupts() are others.
+//
+// Licence: Apache-2.0, as the rest of hapticbridge.
+#ifndef HB_BOARD_H
+#define HB_BOARD_H
+
+#include "hb_protocol.h"
+
+#ifndef HB_LOCK
+#define HB_LOCK noInterrupts
+#define HB_UNLOCK interrupts
+#endif
+
+// Periods of state frames between two frames with the loop's counters.
+static const uint8_t HB_REPORT_EVERY = 32;
+
+class HbBoard {
+ public:
+  // Creates a board without a force; `period` is T in s.
+  HbBoard(const HbSheet& sheet, float period)
+      : device_(with_rate(sheet, period)),
+        loop_(period),
+        period_us_((uint32_t)(1e6f * period + 0.5f)),
+        last_us_(0),
+        is_loop_(false),
+        is_unfit_(false),
+        frames_(0) {
+    memset(&pace_, 0, sizeof pace_);
+    pace_.temperature = NAN;
+  }
+
+  // Decodes one report from the host, as HbDevice does, and gives its order to the loop.
+  bool receive(const uint8_t frame[HB_FRAME_BYTES], uint32_t now_us) {
+    const bool is_valid = device_.receive(frame, now_us);
+    if (is_valid) pass_on();
+    return is_valid;
+  }
+
+  // Takes one byte of a serial line, as HbDevice does.
+  bool receive_byte(uint8_t byte, uint32_t now_us) {
+    const bool is_valid = device_.receive_byte(byte, now_us);
+    if (is_valid) pass_on();
+    return is_valid;
+  }
+
+  // Fills in the requested page of the sheet; returns false without a request.
+  bool answer(uint8_t frame[HB_FRAME_BYTES]) { return device_.answer(frame); }
+
+  // Fills in the next state frame, or now and then the loop's counters.
+  void state(const HbMotion& motion, uint32_t now_us, uint8_t frame[HB_FRAME_BYTES]) {
+    HB_LOCK();
+    const HbReport report = loop_.report();
+    const HbPace pace = pace_;
+    is_unfit_ = (motion.status & (HB_FAULT | HB_NOT_READY)) != 0;
+    HB_UNLOCK();
+    if (!device_.is_loop()) {
+      device_.state(motion, now_us, frame);
+      HB_LOCK();
+      command_ = device_.command();
+      HB_UNLOCK();
+    } else if (++frames_ >= HB_REPORT_EVERY) {
+      frames_ = 0;
+      device_.loop_report(report, pace, frame);
+    } else {
+      device_.loop_state(motion, report, now_us, frame);
+    }
+  }
+
+  // Runs one period, in the timer's interrupt: `position` of the handle in m to `force` in N.
+  void tick(const float position[3], uint32_t now_us, float force[3]) {
+    const uint32_t since = now_us - last_us_;
+    if (pace_.ticks > 0 && since > period_us_ + period_us_ / 2) {
+      pace_.missed += (since + period_us_ / 2) / period_us_ - 1;
+    }
+    last_us_ = now_us;
+    pace_.ticks++;
+    if (!is_loop_ || is_unfit_) loop_.end();  // or its spring would be stretched without a force
+    loop_.tick(position, force);
+    if (is_loop_) return;
+    const HbWrench wrench = command_.wrench(now_us);
+    for (int i = 0; i < 3; i++) force[i] = wrench.force[i];
+  }
+
+  // Temperature of the motors in degrees Celsius, for the host.
+  void set_temperature(float temperature) { pace_.temperature = temperature; }
+
+ private:
+  static HbSheet with_rate(HbSheet sheet, float period) {
+    sheet.loop_rate = 1.0f / period;
+    return sheet;
+  }
+
+  void pass_on() {
+    const HbOrder& order = device_.order();
+    HB_LOCK();
+    is_loop_ = device_.is_loop();
+    command_ = device_.command();
+    if (order.kind != HbOrder::NONE) loop_.set(order.setting);
+    if (order.kind == HbOrder::SHOW) loop_.show(order.shown, order.is_placed);
+    HB_UNLOCK();
+  }
+
+  HbDevice device_;
+  HbLoop loop_;
+  HbCommand command_;
+  HbPace pace_;
+  const uint32_t period_us_;
+  uint32_t last_us_;
+  bool is_loop_, is_unfit_;
+  uint8_t frames_;
+};
+
+#endif
