@@ -18,7 +18,14 @@ from scipy.spatial.transform import Rotation
 from view_cases import FLOOR
 
 from hapticbridge.audit import audit
-from hapticbridge.device.mouse import REST, MouseDevice, Pose, line_of_pose, pose_of_line
+from hapticbridge.device.mouse import (
+    REST,
+    Drag,
+    MouseDevice,
+    Pose,
+    drag_of_line,
+    line_of_drag,
+)
 from hapticbridge.errors import DeviceError, HapticBridgeError
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.recording import read_recording
@@ -55,8 +62,10 @@ def test_the_hand_goes_smoothly_where_it_is_dragged_and_no_faster_than_its_sheet
     assert speed.max() == pytest.approx(0.3, rel=1e-9)
     assert device.info.speed_limit == 0.3
     assert np.abs(np.diff(speed)).max() < 0.1  # no step of the velocity at the drag
-    device.aim(REST)
-    assert np.linalg.norm(moved(device, 3000)["position"][-1]) < 1e-9
+    device.aim(REST, 2)
+    samples = moved(device, 3000)
+    assert np.linalg.norm(samples["position"][-1]) < 1e-9
+    assert np.all(samples["buttons"] == 2)
 
 
 def test_a_speed_that_is_none_is_refused() -> None:
@@ -71,8 +80,13 @@ coordinate = st.floats(-9.0, 9.0)
 def test_a_pose_survives_the_wire(position: tuple[float, float, float], seed: int) -> None:
     quaternion = Rotation.random(rng=np.random.default_rng(seed)).as_quat(scalar_first=True)
     pose: Any = (*position, *quaternion.tolist())
-    read: Any = pose_of_line(line_of_pose(pose))
-    np.testing.assert_allclose(read, pose, rtol=1e-8, atol=1e-8)
+    for buttons in range(4):
+        read: Any = drag_of_line(line_of_drag(Drag(pose, buttons)))
+        np.testing.assert_allclose(read.pose, pose, rtol=1e-8, atol=1e-8)
+        assert read.buttons == buttons
+    for wrong in (-1, 4, "1", None, 1e300):
+        line = json.dumps({"hand": pose, "buttons": wrong}).encode()
+        assert drag_of_line(line) is None
 
 
 @pytest.mark.parametrize(
@@ -84,12 +98,12 @@ def test_a_pose_survives_the_wire(position: tuple[float, float, float], seed: in
     ],
 )  # fmt: skip
 def test_a_line_that_is_no_pose_moves_nothing(values: object) -> None:
-    assert pose_of_line(json.dumps({"hand": values}).encode()) is None
+    assert drag_of_line(json.dumps({"hand": values, "buttons": 0}).encode()) is None
 
 
 @pytest.mark.parametrize("line", [b"", b"[]", b"7", b"\xff", b'{"command": "stop"}', b"[" * 9999])
 def test_another_line_is_no_pose(line: bytes) -> None:
-    assert pose_of_line(line) is None
+    assert drag_of_line(line) is None
 
 
 def test_the_command_shows_the_view_by_itself(
@@ -142,9 +156,9 @@ def test_dragging_on_the_page_moves_the_tool_and_the_recording_is_passive(tmp_pa
     device, window = MouseDevice(), Window(Address(0))
     poses: list[Pose] = []
 
-    def aim(pose: Pose) -> None:
+    def aim(pose: Pose, buttons: int) -> None:
         poses.append(pose)
-        device.aim(pose)
+        device.aim(pose, buttons)
 
     window.on_hand = aim
     with Bridge(str(scene), device, recording=path, observer=window) as bridge:
@@ -163,11 +177,15 @@ def test_dragging_on_the_page_moves_the_tool_and_the_recording_is_passive(tmp_pa
                 while abs(state["tool_position"][0][0] - 0.02) > 1e-3:
                     assert time.monotonic() < end
                     time.sleep(0.02)
+                page.send("hold button 0", value=True)
+                while bridge.latest_records(1)["buttons"][0] != 1:
+                    assert time.monotonic() < end
+                    time.sleep(0.02)
         finally:
             bridge.stop("test")
             thread.join(PATIENCE)
     # the ball starts at 0.03 m; what was no pose has moved nothing
-    assert [np.round(pose, 6).tolist() for pose in poses] == [[0.02, 0.0, 0.02, 1.0, 0.0, 0.0, 0.0]]
+    assert {tuple(np.round(pose, 6)) for pose in poses} == {(0.02, 0.0, 0.02, 1.0, 0.0, 0.0, 0.0)}
     ticks = read_recording(path).ticks
     assert ticks["device_position"][-1] == pytest.approx([0.02, 0.0, 0.02], abs=1e-3)
     assert audit(path).verdict == "passive"

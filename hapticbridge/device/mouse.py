@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,18 +39,35 @@ frame."""
 FARTHEST = 10.0
 """Largest coordinate in m that a page may send."""
 
+BUTTONS = 4
+"""Number of states of the two buttons on the page."""
+
 # Wire format between the page's process and the bridge
 
 
-def line_of_pose(pose: Pose) -> bytes:
-    """Returns a pose as a line of JSON."""
-    return json.dumps({"hand": [float(f"{value:.9g}") for value in pose]}).encode() + b"\n"
+class Drag(NamedTuple):
+    """Where the hand on the page is dragged.
+
+    Attributes:
+        pose: Pose to go to.
+        buttons: Bits of the buttons that are held.
+    """
+
+    pose: Pose
+    buttons: int = 0
 
 
-def pose_of_line(line: bytes) -> Pose | None:
-    """Returns the pose of a line, its quaternion normalized; None if the line holds none."""
+def line_of_drag(drag: Drag) -> bytes:
+    """Returns it as a line of JSON."""
+    pose = [float(f"{value:.9g}") for value in drag.pose]
+    return json.dumps({"hand": pose, "buttons": drag.buttons}).encode() + b"\n"
+
+
+def drag_of_line(line: bytes) -> Drag | None:
+    """Returns what a line says, its quaternion normalized; None if the line holds no pose."""
     try:
-        values = json.loads(line)["hand"]
+        told = json.loads(line)
+        values, buttons = told["hand"], told["buttons"]
     except (ValueError, TypeError, KeyError, RecursionError):
         return None
     if not isinstance(values, list) or len(values) != 7 or not all(map(is_number, values)):
@@ -59,9 +77,11 @@ def pose_of_line(line: bytes) -> Pose | None:
     size = math.hypot(*values[3:])
     if not 0.5 <= size <= 2.0:
         return None
+    if buttons not in range(BUTTONS):
+        return None
     x, y, z = (float(value) for value in values[:3])
     qw, qx, qy, qz = (value / size for value in values[3:])
-    return x, y, z, qw, qx, qy, qz
+    return Drag((x, y, z, qw, qx, qy, qz), int(buttons))
 
 
 # The device
@@ -109,9 +129,9 @@ class MouseDevice:
         self._position, self._between = np.zeros(3), np.zeros(3)
         self._to_origin()
 
-    def aim(self, pose: Pose) -> None:
-        """Sets the pose to go to, from any thread."""
-        self._target = pose
+    def aim(self, pose: Pose, buttons: int = 0) -> None:
+        """Sets the pose to go to and the bits of held buttons, from any thread."""
+        self._target, self._buttons = pose, buttons
 
     def start(self, period: float) -> NDArray[np.void]:
         """Places the hand at the origin.
@@ -153,7 +173,7 @@ class MouseDevice:
         """Does nothing: the view belongs to the run."""
 
     def _to_origin(self) -> None:
-        self._target, self._has_begun = REST, False
+        self._target, self._buttons, self._has_begun = REST, 0, False
         self._position[:] = self._between[:] = 0.0
         self._quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
         self._half_turned = self._quaternion
@@ -168,7 +188,7 @@ class MouseDevice:
         self._quaternion = canonical(product(turn, self._quaternion))
 
     def _fill(self, sample: NDArray[np.void]) -> None:
-        sample[0] = (self._position, self._quaternion, 0)
+        sample[0] = (self._position, self._quaternion, self._buttons)
 
 
 def _limited(step: float, rate: float, period: float) -> float:

@@ -20,7 +20,7 @@ import viser
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import RunCoupling
-from hapticbridge.device.mouse import REST, Pose, line_of_pose
+from hapticbridge.device.mouse import REST, Drag, Pose, line_of_drag
 from hapticbridge.errors import CommandError
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.pose import (
@@ -85,13 +85,13 @@ class Outlet:
     def __init__(self, file: int) -> None:
         self._file = file
         self._waiting: dict[str, Command] = {}
-        self._pose: Pose | None = None
+        self._drag: Drag | None = None
         self._has_news = threading.Condition()
 
-    def drag(self, pose: Pose) -> None:
-        """Queues the hand's pose; never waits for the bridge."""
+    def drag(self, drag: Drag) -> None:
+        """Queues the hand's pose and buttons; never waits for the bridge."""
         with self._has_news:
-            self._pose = pose
+            self._drag = drag
             self._has_news.notify()
 
     def ask(self, command: Command) -> None:
@@ -111,7 +111,7 @@ class Outlet:
         with contextlib.suppress(OSError):
             while True:
                 with self._has_news:
-                    self._has_news.wait_for(lambda: self._waiting or self._pose)
+                    self._has_news.wait_for(lambda: self._waiting or self._drag)
                     line, pace = self._next()
                 os.write(self._file, line)
                 time.sleep(pace)
@@ -121,8 +121,8 @@ class Outlet:
         if self._waiting:
             kind = "Stop" if "Stop" in self._waiting else next(iter(self._waiting))
             return line_of(self._waiting.pop(kind)), PACE
-        pose, self._pose = self._pose or REST, None
-        return line_of_pose(pose), HAND_INTERVAL
+        drag, self._drag = self._drag or Drag(REST), None
+        return line_of_drag(drag), HAND_INTERVAL
 
 
 class Sliders:
@@ -347,21 +347,29 @@ def add_hand(
     server: viser.ViserServer,
     parameters: RunParameters,
     extent: float,
-    drag: Callable[[Pose], None],
+    drag: Callable[[Drag], None],
 ) -> None:
-    """Adds arrows and rings at the handle's start; ``drag`` is called as they are dragged."""
+    """Adds arrows and rings at the handle's start, and buttons; ``drag`` is called by each."""
     start = parameters.handle_origin
     hand = server.scene.add_transform_controls(
         "/hand", scale=SIZE * extent, depth_test=False, position=start[:3], wxyz=start[3:]
     )
     server.gui.add_markdown("drag the arrows at the tool: the hand follows, and feels nothing")
 
-    async def dragged(_: viser.TransformControlsEvent) -> None:  # in order, unlike threads
+    boxes = [server.gui.add_checkbox(f"hold button {k}", initial_value=False) for k in range(2)]
+
+    def tell() -> None:
         # a browser may send anything
         with contextlib.suppress(ValueError, TypeError):
-            drag(device_pose(parameters, hand.position.tolist(), hand.wxyz.tolist()))
+            pose = device_pose(parameters, hand.position.tolist(), hand.wxyz.tolist())
+            drag(Drag(pose, sum(bool(box.value) << k for k, box in enumerate(boxes))))
+
+    async def dragged(_: viser.TransformControlsEvent) -> None:  # in order, unlike threads
+        tell()
 
     hand.on_update(dragged)
+    for box in boxes:
+        box.on_update(by_hand(tell))
 
 
 def by_hand(act: Callable[[], None]) -> Callable[[viser.GuiEvent[Any]], None]:

@@ -21,7 +21,7 @@ from typing import IO, cast
 from urllib.parse import parse_qs, urlsplit
 
 from hapticbridge.arguments import check_fields, option
-from hapticbridge.device.mouse import Pose, pose_of_line
+from hapticbridge.device.mouse import Pose, drag_of_line
 from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.files import install_command
 from hapticbridge.recording import Attachment
@@ -152,7 +152,7 @@ class Window:
     Attributes:
         address: Port and token of the page.
         on_hand: Called from a thread with each pose, in the device's frame, to which the hand on
-            the page is dragged; None: the page has no hand.
+            the page is dragged, and the bits of held buttons; None: the page has no hand.
         on_command: Called from a thread with each command of the page. It raises a
             ``CommandError`` to refuse one, and the page then shows the reason.
         url: Address to open in a browser, once the page is served.
@@ -169,7 +169,7 @@ class Window:
         self._process: subprocess.Popen[bytes] | None = None
         self.url = ""
         self.on_command: Callable[[Command], None] | None = None
-        self.on_hand: Callable[[Pose], None] | None = None
+        self.on_hand: Callable[[Pose, int], None] | None = None
 
     def start(
         self,
@@ -252,8 +252,8 @@ class Window:
             while line := stream.readline(MAX_LINE + 1):
                 if not line.endswith(b"\n"):
                     return  # longer than any command, so not from the process that was started
-                if self.on_hand is not None and (pose := pose_of_line(line)) is not None:
-                    self.on_hand(pose)
+                if self.on_hand is not None and (drag := drag_of_line(line)) is not None:
+                    self.on_hand(*drag)
                     time.sleep(HAND_INTERVAL)
                     continue
                 try:
