@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from hapticbridge import (
     read_recording,
 )
 from hapticbridge.errors import DeviceLost, HapticBridgeError
-from hapticbridge.program import device_loop, poses
+from hapticbridge.program import poses
 from hapticbridge.program.device_loop import Handle, Surface
 from hapticbridge.program.messages import (
     CALL_DTYPE,
@@ -129,6 +129,8 @@ def test_each_mistake_of_a_program_gets_a_sentence() -> None:
             ([0.0, np.nan, 0.0], "must be finite"),
             ([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], r"norm 0; it must be 1, in the order \(w, x"),
             ("here", "must be numbers"),
+            (np.diag([2.0, 1.0, 1.0, 1.0]), "is no rotation"),
+            (np.diag([-1.0, 1.0, 1.0, 1.0]), "is no rotation"),
         ):
             with pytest.raises(HapticBridgeError, match=words):
                 device.show(pose)
@@ -136,6 +138,16 @@ def test_each_mistake_of_a_program_gets_a_sentence() -> None:
             device.show(START, [1.0, 2.0])
         with pytest.raises(HapticBridgeError, match="normal of a surface"):
             device.show(START, None, [Surface((0, 0, 0), (0, 0, 0))])
+        strange: Any
+        for strange in (Surface((0, 0, 0), (0, 0, 1)), [((0, 0, 0), (0, 0, 1))]):
+            with pytest.raises(HapticBridgeError, match="must be a list of Surface"):
+                device.show(START, None, strange)
+        for wrong in (Surface((0, 0), (0, 0, 1)), Surface((0, 0, 0), (0, 0, 1), -0.1)):
+            with pytest.raises(HapticBridgeError, match="a point of 3 numbers, and a gap"):
+                device.show(START, None, [wrong])
+        for strange, words in ((np.nan, "finite"), (-1.0, "above 0"), ("x", "numbers")):
+            with pytest.raises(HapticBridgeError, match=words):
+                device.advance(strange)
         with pytest.raises(HapticBridgeError, match="17 surfaces are shown; 16 are the most"):
             device.show(START, None, [Surface((0, 0, 0), (0, 0, 1))] * 17)
 
@@ -149,6 +161,11 @@ def test_each_mistake_of_a_program_gets_a_sentence() -> None:
         ("simulated", {"python": "/no/python"}, "/no/python"),
         ("remote:here", {}, "remote:HOST:PORT"),
         ("remote:here:1", {"scale": 2.0}, "are those of 'hapticbridge serve' there"),
+        ("remote:here:1", {}, "a remote loop needs its token"),
+        ("remote:no-such-host.invalid:1", {"token": "t"}, "there is no host 'no-such-host.inv"),
+        ("remote:127.0.0.1:1", {"token": "t"}, "no device loop answers at 127.0.0.1:1"),
+        (5, {}, "device is 5; it must be a name"),
+        ("simulated", {"recording": ""}, "recording is ''; it must be the name of a file"),
     ],
 )
 def test_a_loop_that_cannot_start_says_why(device: str, options: Any, words: str) -> None:
@@ -179,6 +196,35 @@ def test_a_loop_that_dies_is_lost_and_not_waited_for() -> None:
                 time.sleep(0.01)
 
 
+def test_a_loop_that_was_killed_leaves_a_recording_to_audit(tmp_path: Path) -> None:
+    for k in range(3):
+        path = tmp_path / f"{k}.mcap"
+        with DeviceLoop("simulated", recording=path) as device:
+            pose = START.copy()
+            with suppress(DeviceLost):
+                for step in range(150):
+                    device.show(pose)
+                    pose[0] += 1e-5
+                    time.sleep(0.003)
+                    if step == 100 + 7 * k:
+                        assert device.pid is not None
+                        os.kill(device.pid, signal.SIGKILL)
+        end = time.monotonic() + 30.0
+        while read_recording(path).events[-1]["event"] != "bridge_died":
+            assert time.monotonic() < end
+            time.sleep(0.2)
+        report = audit(path)
+        assert (report.verdict, report.agreement) == ("passive", "bit for bit")
+        assert "the bridge died" in str(report)
+
+
+def test_a_loop_says_what_its_device_does_not_bear(capfd: pytest.CaptureFixture[str]) -> None:
+    with DeviceLoop("simulated", is_simulated=True, stiffness=1e5, scene_rate=1000.0) as device:
+        device.show(START)  # a rate at which the scene would step in every tick
+        device.advance(0.1)
+    assert "device damping 2 < 50" in capfd.readouterr().err
+
+
 def test_a_loop_ends_with_the_program_that_was_killed(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     script = f"""
@@ -201,7 +247,25 @@ with hapticbridge.DeviceLoop("simulated", recording={str(path)!r}) as device:
             break
         time.sleep(0.2)
     assert recording.events[-1]["event"] == "stop"
-    assert recording.events[-1]["reason"] == "program"
+    assert recording.events[-1]["reason"] == "program that was killed"
+
+
+def test_the_recording_tells_how_the_program_left(tmp_path: Path) -> None:
+    for error, reason in ((None, "program"), (KeyError("its own"), "program that failed")):
+        path = tmp_path / "run.mcap"
+        with suppress(KeyError), DeviceLoop("simulated", recording=path) as device:
+            device.show(START)
+            if error is not None:
+                raise error
+        assert read_recording(path).events[-1]["reason"] == reason
+
+
+def test_a_loop_is_opened_once() -> None:
+    device = DeviceLoop("simulated", is_simulated=True).open()
+    for _ in range(2):
+        with pytest.raises(HapticBridgeError, match="opened once; make another one"):
+            device.open()
+        device.close()
 
 
 # Frames
@@ -418,11 +482,10 @@ def test_simulated_time_that_no_program_moves_ends_with_ctrl_c(tmp_path: Path) -
     assert audit(path).verdict == "passive"
 
 
-def test_a_wrong_token_gets_no_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_loop, "ANSWER_TIME", 0.5)
+def test_a_wrong_token_is_told_at_once(tmp_path: Path) -> None:
     with (
         served(tmp_path / "run.mcap") as port,
-        pytest.raises(HapticBridgeError, match="no device loop answers at 127"),
+        pytest.raises(HapticBridgeError, match="has another token or another version"),
         DeviceLoop(f"remote:127.0.0.1:{port}", token="another"),
     ):
         pass

@@ -19,9 +19,10 @@ from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.record import POST_DTYPE, SAMPLE_DTYPE
 from hapticbridge.recording import read_recording
+from hapticbridge.recording.format import SHOWN_EVENT
 from hapticbridge.run.commands import Couple, Repeat, Reset, Switch
 from hapticbridge.run.endpoint import posted_scene, program_options
-from hapticbridge.run.posted_scene import EVENT, is_post
+from hapticbridge.run.posted_scene import is_post
 
 CREDIT = 0.05
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -384,10 +385,10 @@ def test_a_post_that_was_changed_left_out_or_damaged_is_found(tmp_path: Path) ->
     path = tmp_path / "run.mcap"
     run(follows, path, duration=0.5)
     recording = read_recording(path)
-    assert sum(e.get("count", 0) for e in recording.events if e["event"] == EVENT) == 25
+    assert sum(e.get("count", 0) for e in recording.events if e["event"] == SHOWN_EVENT) == 25
 
     def first(events: list[dict[str, Any]]) -> dict[str, Any]:
-        return next(event for event in events[20:] if event["event"] == EVENT)
+        return next(event for event in events[20:] if event["event"] == SHOWN_EVENT)
 
     def alters(events: list[dict[str, Any]], _: Any) -> None:
         import base64

@@ -160,6 +160,14 @@ _NO_THREAD = "can't start new thread"  # Python's own words
 def _system_fault(error: MemoryError | ImportError | OSError | RuntimeError) -> int:
     """Says what the system refused; raises what is no fault of the system's again."""
     number = error.errno if isinstance(error, OSError) else None
+    if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("hapticbridge"):
+        print(  # the consoles are a package, too
+            f"error: the package '{error.name}' is not in the environment of {sys.executable}. "
+            "Commands need all that hapticbridge depends on; a program's side of a device loop "
+            "needs NumPy alone (HAPTICBRIDGE_PYTHON names the Python with the rest)",
+            file=sys.stderr,
+        )
+        return USAGE_ERROR
     if isinstance(error, RuntimeError):
         if str(error) != _NO_THREAD:
             raise error

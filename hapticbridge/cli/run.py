@@ -130,8 +130,12 @@ def announce(setup: RunSetup, named: Mapping[str, float], *, is_method_chosen: b
             f"  the device reaches {format_si(reach, 'm')} from its centre; beyond that the "
             "handle stays and no force acts"
         )
-    if not method.has_law:
-        return  # printed once the weld is measured: ``announce_measured``
+    if method.has_law:  # else printed once the weld is measured: ``announce_measured``
+        warn_of_conditions(setup)
+
+
+def warn_of_conditions(setup: RunSetup) -> None:
+    """Prints the device conditions that do not hold."""
     for condition in conditions_of(setup.loop):
         if not condition.holds:
             err.print(f"[yellow]warning:[/yellow] {condition.sentence()}")

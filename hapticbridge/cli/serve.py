@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from threading import Thread
 from typing import ClassVar
@@ -23,6 +24,7 @@ from hapticbridge.cli.run import (
     open_window,
     print_summary,
     refuse_overwriting,
+    warn_of_conditions,
 )
 from hapticbridge.cli.terminal import err, notify, working
 from hapticbridge.clock import RealClock
@@ -37,6 +39,9 @@ from hapticbridge.signals import interrupting_on_signals
 
 LOOK = 0.5
 """Time in s between two looks whether the program that started the loop still lives."""
+
+GONE = "program that was killed"
+"""Reason of a stop, in the recording."""
 
 
 def _watch_parent(parent: int, leave: Callable[[], None]) -> None:
@@ -118,7 +123,9 @@ class Serve:
                     observer=window,
                 )
             attach_window(window, bridge, bridge.device)
-            if not self.as_json:
+            if self.as_json:
+                warn_of_conditions(bridge.setup)
+            else:
                 announce(bridge.setup, self.coupling, is_method_chosen=False)
             endpoint = Endpoint(self.host, self.port, token.encode(), self._on_leave(bridge, clock))
             with working("rehearsing the start of the run"):
@@ -127,7 +134,7 @@ class Serve:
             announce_window(window, bridge.device)
             endpoint.open(bridge)
             if self.as_json:
-                leave = self._on_leave(bridge, clock)
+                leave = partial(self._on_leave(bridge, clock), GONE)
                 Thread(target=_watch_parent, args=(os.getppid(), leave), daemon=True).start()
             self._tell(endpoint, token)
             error: BaseException | None = None
@@ -142,12 +149,12 @@ class Serve:
                 print_summary(summary := bridge.summary(), self.record, as_json=self.as_json)
         return exit_code(summary)
 
-    def _on_leave(self, bridge: Bridge, clock: RealClock | GrantedClock) -> Callable[[], None]:
-        """Returns what is done when the program leaves."""
+    def _on_leave(self, bridge: Bridge, clock: RealClock | GrantedClock) -> Callable[[str], None]:
+        """Returns what is done when the program leaves, with the reason."""
 
-        def leave() -> None:
+        def leave(reason: str) -> None:
             if self.as_json:
-                bridge.stop("program")
+                bridge.stop(reason)
                 if isinstance(clock, GrantedClock):
                     clock.release()
 

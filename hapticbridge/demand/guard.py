@@ -245,7 +245,7 @@ def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
     if is_bound and isinstance(clock, SimulatedClock):
         raise DeviceError(
             f"the device '{name}' moves in real time, so the loop cannot run faster; leave out "
-            "--fast (in code: the SimulatedClock)"
+            "--fast (in code: the SimulatedClock, or is_simulated)"
         )
 
 

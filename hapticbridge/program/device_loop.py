@@ -20,7 +20,15 @@ from numpy.typing import ArrayLike, NDArray
 from hapticbridge.errors import DeviceLost, HapticBridgeError, SafetyTrip
 from hapticbridge.kernel.record import PLANES, POST_DTYPE, TICK_DTYPE
 from hapticbridge.program.loop_process import TOKEN_VARIABLE, LoopProcess
-from hapticbridge.program.messages import CALL_DTYPE, STATE_DTYPE, VERSION, Call, packed, unpacked
+from hapticbridge.program.messages import (
+    CALL_DTYPE,
+    STATE_DTYPE,
+    STRANGER,
+    VERSION,
+    Call,
+    packed,
+    unpacked,
+)
 from hapticbridge.program.poses import matrix_of, numbers_of, offset_between, pose_of
 
 Array = NDArray[np.float64]
@@ -34,6 +42,9 @@ ANSWER_TIME = 30.0
 
 REPEAT = 0.05
 """Time in s after which a call without an answer is sent again."""
+
+LONGEST_ADVANCE = 1e4
+"""Longest simulated time in s of one call."""
 
 SILENCE = 2.0
 """Time in s without a word from the loop after which it counts as lost."""
@@ -131,12 +142,23 @@ class DeviceLoop:
         self._token = (
             token or os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(18)
         ).encode()
+        if not isinstance(device, str):
+            raise HapticBridgeError(
+                f"device is {device!r}; it must be a name as 'hapticbridge devices' prints it"
+            )
         self._remote = _address(device) if device.startswith("remote:") else None
         if self._remote and (options or recording or is_simulated or python):
             raise HapticBridgeError(
                 "options, recording, time and python of a remote loop are those of 'hapticbridge "
                 "serve' there"
             )
+        if self._remote and not (token or os.environ.get(TOKEN_VARIABLE)):
+            raise HapticBridgeError(
+                "a remote loop needs its token, which 'hapticbridge serve' has printed: token= or "
+                f"the variable {TOKEN_VARIABLE}"
+            )
+        if recording is not None and not str(recording):
+            raise HapticBridgeError("recording is ''; it must be the name of a file, or None")
         chosen = str(python or os.environ.get(PYTHON_VARIABLE) or sys.executable)
         command = [chosen, "-m", "hapticbridge", "serve", device, "--port", "0", "--json"]
         command += _flags(options)
@@ -152,13 +174,29 @@ class DeviceLoop:
         self._heard = 0.0
         self._applied, self._shown = np.zeros(6), np.zeros(7)
         self._is_closed, self._placed = False, 0
+        self._is_stranger, self._is_absent = False, False
         self.summary: dict[str, Any] = {}
 
     def __enter__(self) -> Self:
+        return self.open()
+
+    def open(self) -> Self:
+        """Waits until the loop runs; ``with`` does it, and closes it, too.
+
+        Raises:
+            HapticBridgeError: The loop cannot start, no loop answers, or it was opened before.
+        """
+        if self._socket is not None or self._is_closed:
+            raise HapticBridgeError("a DeviceLoop is opened once; make another one")
         address = self._remote or (self._process.start() if self._process else ("", 0))
         family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-        self._socket = channel = socket.socket(family, socket.SOCK_DGRAM)
-        channel.connect(address)
+        channel = socket.socket(family, socket.SOCK_DGRAM)
+        try:
+            channel.connect(address)
+        except OSError as error:
+            channel.close()
+            raise HapticBridgeError(f"there is no host '{address[0]}': {error.strerror}") from None
+        self._socket = channel
         self._listener = threading.Thread(
             target=self._listen, args=(channel,), name="device loop", daemon=True
         )
@@ -166,12 +204,15 @@ class DeviceLoop:
         end = time.monotonic() + ANSWER_TIME
         while not self._has_state.wait(REPEAT):
             self._send(Call.GREET)
-            if time.monotonic() > end:
+            if time.monotonic() > end or self._is_stranger or self._is_absent:
                 self.close()
-                host, port = address[:2]
+                where = f"{address[0]}:{address[1]}"
+                if self._is_stranger:
+                    raise HapticBridgeError(
+                        f"the device loop at {where} has another token or another version"
+                    )
                 raise HapticBridgeError(
-                    f"no device loop answers at {host}:{port}: is 'hapticbridge serve' running "
-                    "there, with this token and version?"
+                    f"no device loop answers at {where}: is 'hapticbridge serve' running there?"
                 )
         return self
 
@@ -181,7 +222,8 @@ class DeviceLoop:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self.close()
+        self._call["ticks"] = error is not None
+        self._close()
 
     # What a program calls
 
@@ -295,6 +337,10 @@ class DeviceLoop:
             raise HapticBridgeError(
                 "real time goes on by itself; advance() is for is_simulated=True"
             )
+        if not 0.0 < float(numbers_of("seconds", seconds)) <= LONGEST_ADVANCE:
+            raise HapticBridgeError(
+                f"seconds is {seconds!r}; it must be above 0, up to {LONGEST_ADVANCE:g}"
+            )
         with self._lock:
             self._call["ticks"] = max(round(seconds / float(state["period"])), 1)
             self._send(Call.ADVANCE)
@@ -329,6 +375,10 @@ class DeviceLoop:
 
     def close(self) -> None:
         """Ends the force and the loop, and waits until its recording is closed."""
+        self._call["ticks"] = 0
+        self._close()
+
+    def _close(self) -> None:
         if self._is_closed:
             return
         self._is_closed = True
@@ -338,7 +388,7 @@ class DeviceLoop:
             self._listener.join(1.0)
             self._socket.close()
         if self._process is not None:
-            self.summary = self._process.end()
+            self.summary = self._process.end(ANSWER_TIME if self._heard else 0.0)
 
     # Datagrams
 
@@ -358,12 +408,20 @@ class DeviceLoop:
             raise HapticBridgeError(f"{len(surfaces)} surfaces are shown; {PLANES} are the most")
         post["planes"] = len(surfaces)
         for k, surface in enumerate(surfaces):
+            if not isinstance(surface, Surface):
+                raise HapticBridgeError(
+                    f"surfaces are {surfaces!r}; they must be a list of Surface(point, normal, gap)"
+                )
             normal, part = numbers_of("normal", surface.normal), slice(3 * k, 3 * k + 3)
             if normal.shape != (3,) or not np.any(normal):
                 raise HapticBridgeError("the normal of a surface must be 3 numbers, not all 0")
             post["normals"][0, part] = normal / np.linalg.norm(normal)
-            post["arms"][0, part] = numbers_of("point", surface.point) - own[:3]
-            post["gaps"][0, k] = max(float(numbers_of("gap", surface.gap)), 0.0)
+            point, gap = numbers_of("point", surface.point), numbers_of("gap", surface.gap)
+            if point.shape != (3,) or gap.shape != () or gap < 0.0:
+                raise HapticBridgeError(
+                    "a surface has a point of 3 numbers, and a gap that is one number, >= 0"
+                )
+            post["arms"][0, part], post["gaps"][0, k] = point - own[:3], gap
         return post
 
     def _handle_in(self, state: np.void) -> tuple[Array, Array]:
@@ -393,11 +451,13 @@ class DeviceLoop:
         while not self._is_closed:
             try:
                 data = channel.recv(4096)
-            except ConnectionError:  # no loop is at that port yet
+            except ConnectionError:  # no loop is at that port, or no longer
+                self._is_absent = True
                 time.sleep(REPEAT)
                 continue
             except OSError:
                 return
+            self._is_stranger |= data == STRANGER
             state = unpacked(data, STATE_DTYPE, self._token)
             if state is None or state["program"] != self._call["program"]:
                 continue

@@ -118,7 +118,7 @@ class HapticDevice(Teleoperator):  # type: ignore[misc]
             is_simulated=config.is_simulated,
             python=config.python,
             **config.options,
-        ).__enter__()
+        ).open()
         self._has_feedback = False
         if config.start:
             self.loop.show(_pose(np.array(config.start)))

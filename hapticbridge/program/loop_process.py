@@ -102,18 +102,24 @@ class LoopProcess:
         last = (told or self._lines or ["it said nothing"])[-1]
         return last.partition(": ")[2] if last.startswith(_HEADS) else last
 
-    def end(self) -> dict[str, Any]:
-        """Ends it in order, and returns its summary; empty if it gave none."""
+    def end(self, patience: float = 0.0) -> dict[str, Any]:
+        """Ends it in order, and returns its summary; empty if it gave none.
+
+        ``patience`` is the time in s that it has to end by itself.
+        """
         process = self._process
         if process is None:
             return {}
-        with suppress(OSError):
-            process.send_signal(signal.SIGINT)
-        try:
-            process.wait(CLOSE_TIME)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait(CLOSE_TIME)
+        for end, wait in (
+            (None, patience),
+            (signal.SIGINT, CLOSE_TIME),
+            (signal.SIGKILL, CLOSE_TIME),
+        ):
+            with suppress(OSError, subprocess.TimeoutExpired):
+                if end is not None:
+                    process.send_signal(end)
+                process.wait(wait)
+                break
         self._reader.join(CLOSE_TIME)
         with cast(IO[str], process.stdout) as told:
             text = told.read()

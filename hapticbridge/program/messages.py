@@ -23,6 +23,9 @@ VERSION = 2
 TAG = 16
 """Bytes of a tag; 2^128 guesses would be needed."""
 
+STRANGER = b"hapticbridge: another token or version"
+"""Answer to a datagram that is not taken. It has no tag, because the token may be missing."""
+
 WORDS = 300
 """Bytes of a sentence in a datagram."""
 
@@ -56,7 +59,8 @@ CALL_DTYPE = np.dtype(
     ]
 )
 """From the program to the loop: a random number that stands for the program, number of its call,
-what it is (``Call``), ticks of simulated time, and the tool as shown last."""
+what it is (``Call``), ticks of simulated time (of LEAVE, 1 if an exception ends it), and the tool
+as shown last."""
 
 STATE_DTYPE = np.dtype(
     [

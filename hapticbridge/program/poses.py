@@ -9,6 +9,9 @@ from hapticbridge.errors import HapticBridgeError
 
 Array = NDArray[np.float64]
 
+ROUNDED = 1e-3
+"""Largest error of a rotation matrix, as of one in single precision that was multiplied often."""
+
 
 def numbers_of(name: str, values: ArrayLike) -> Array:
     """Returns values as an array of any shape.
@@ -37,6 +40,12 @@ def pose_of(pose: ArrayLike, orientation: Array) -> Array:
     """
     numbers = numbers_of("pose", pose)
     if numbers.shape == (4, 4):
+        turn = numbers[:3, :3]
+        if not np.allclose(turn @ turn.T, np.eye(3), atol=ROUNDED) or np.linalg.det(turn) < 0.0:
+            raise HapticBridgeError(
+                f"the pose's matrix {turn.tolist()} is no rotation: its rows must be of length 1, "
+                "at right angles, and right-handed"
+            )
         result = np.append(numbers[:3, 3], quaternion_of(numbers[:3, :3]))
     elif numbers.shape == (3,):
         result = np.append(numbers, orientation)

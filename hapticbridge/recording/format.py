@@ -32,6 +32,7 @@ from hapticbridge.kernel.record import FORMAT, TICK_DTYPE, columns_of
 
 TICK_TOPIC = "/tick"
 EVENT_TOPIC = "/event"
+SHOWN_EVENT = "shown"  # the poses that another program has shown since the last one
 TICK_ENCODING = "cdr"
 EVENT_SCHEMA_NAME = "std_msgs/msg/String"
 EVENT_SCHEMA = b"string data # the event and what belongs to it, as JSON\n"

@@ -29,8 +29,8 @@ from rich.text import Text
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import remove_file
-from hapticbridge.kernel.record import TickFlag
-from hapticbridge.recording.format import Attachment, further_hands
+from hapticbridge.kernel.record import TICK_DTYPE, TickFlag
+from hapticbridge.recording.format import SHOWN_EVENT, Attachment, further_hands
 from hapticbridge.recording.ring import Ring
 from hapticbridge.recording.writer import RecordingWriter
 from hapticbridge.units import format_energy, format_forces
@@ -229,6 +229,8 @@ class _Session:
         self._last_time = 0
         self._last_tick = -1
         self._has_begun = self._has_reported_full = False
+        self._is_posted = float(configuration["metadata"].get("credit", 0.0)) > 0.0
+        self._posts, self._waiting = 0, np.zeros(0, TICK_DTYPE)
 
     def run(self, inbox: SimpleQueue[dict[str, Any] | None]) -> None:
         """Records until the bridge closes or dies."""
@@ -245,6 +247,8 @@ class _Session:
                 time.sleep(POLL)
         while self._drain_once():
             pass
+        if end != "died" and self._writer is not None:
+            self._write_ticks(self._waiting)
         if end == "died":
             self.ring.unlink()
             self._write_event({"event": "bridge_died", "tick": self._last_tick}, self._last_time)
@@ -257,15 +261,33 @@ class _Session:
 
     def _drain_once(self) -> int:
         rows = self.ring.take(self._batch)  # the producer adds one record per hand at once
-        if rows.size:
-            self._last_time = int(rows["deadline_ns"][-1])
-            self._last_tick = int(rows["tick"][-1])
-            if self._writer is not None:
-                for hand in range(self._hands):
-                    self._writer.write_ticks(rows[hand :: self._hands], hand)
+        if self._writer is not None:
+            self._write_ticks(self._known(rows))
         if self._live is not None:
             self._live.update(rows)
         return int(rows.size)
+
+    def _known(self, rows: NDArray[np.void]) -> NDArray[np.void]:
+        """Returns the records whose events were written, too.
+
+        What another program has shown comes a little after the tick that took it over. Records that
+        are written without it could not be audited if the bridge dies.
+        """
+        if not self._is_posted:
+            return rows
+        if self._waiting.size:
+            rows = np.concatenate([self._waiting, rows])
+        count = int(np.searchsorted(rows["scene_step"], self._posts, side="right"))
+        self._waiting = rows[count:].copy()
+        return rows[:count]
+
+    def _write_ticks(self, rows: NDArray[np.void]) -> None:
+        assert self._writer is not None
+        if rows.size:
+            self._last_time = int(rows["deadline_ns"][-1])
+            self._last_tick = int(rows["tick"][-1])
+            for hand in range(self._hands):
+                self._writer.write_ticks(rows[hand :: self._hands], hand)
 
     def _report_if_full(self) -> None:
         """Reports a full disk once; the reserve holds the data until the bridge ends.
@@ -294,6 +316,7 @@ class _Session:
 
     def _write_event(self, event: dict[str, Any], time_ns: int) -> None:
         if self._writer is not None:
+            self._posts += event.get("count", 0) if event["event"] == SHOWN_EVENT else 0
             self._writer.write_event(event, time_ns)
             self._has_begun = True
 

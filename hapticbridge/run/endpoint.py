@@ -27,6 +27,7 @@ from hapticbridge.kernel.tick_guard import DEVICE_BUTTONS
 from hapticbridge.program.messages import (
     CALL_DTYPE,
     STATE_DTYPE,
+    STRANGER,
     VERSION,
     WORDS,
     Call,
@@ -61,6 +62,9 @@ STOP_LOOK = 0.1
 
 LAST_WORDS = 0.3
 """Time in s for which the end of the run is told again, because a datagram may be lost."""
+
+LEFT, FAILED = "program", "program that failed"
+"""Reasons of a stop, in the recording: the program has left the loop, or an exception has."""
 
 TAKEN_OVER = "another program has taken over the device loop; one at a time has it"
 
@@ -101,6 +105,8 @@ def program_options(options: BridgeOptions) -> BridgeOptions:
         if getattr(options, name) is not None:
             raise HapticBridgeError(f"{name} is for a scene that hapticbridge steps; leave it out")
     rate = PROGRAM_RATE if options.scene_rate == AUTO else options.scene_rate
+    if options.scene_ticks == 0 and rate != PROGRAM_RATE:  # faster than every second tick
+        rate = 0.5 * options.loop_rate
     return replace(options, method=PROGRAM_METHOD, scene_rate=rate)
 
 
@@ -153,7 +159,7 @@ class Endpoint:
         host: Address on which it listens.
         port: Port; 0 takes any free one.
         token: Token that the program must have.
-        on_leave: Called when the program leaves.
+        on_leave: Called with a reason when the program leaves.
 
     Attributes:
         address: Host and port.
@@ -163,7 +169,7 @@ class Endpoint:
     """
 
     def __init__(
-        self, host: str, port: int, token: bytes, on_leave: Callable[[], None] | None = None
+        self, host: str, port: int, token: bytes, on_leave: Callable[[str], None] | None = None
     ) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
@@ -242,6 +248,8 @@ class Endpoint:
         """Takes a call; a program that greets takes the loop over."""
         call = unpacked(data, CALL_DTYPE, self._token)
         if call is None:
+            if len(data) > len(STRANGER):  # so that two loops cannot answer each other
+                self._socket.sendto(STRANGER, peer)
             return
         program, number, kind = int(call["program"]), int(call["sequence"]), int(call["call"])
         if number <= self._calls.get(program, 0):
@@ -256,7 +264,7 @@ class Endpoint:
         if kind == Call.ADVANCE and isinstance(self._bridge.clock, GrantedClock):
             self._bridge.clock.grant(max(int(call["ticks"]), 1), number)
         elif kind == Call.LEAVE and self._on_leave is not None:
-            self._on_leave()
+            self._on_leave(FAILED if call["ticks"] else LEFT)
         elif kind in (Call.SHOW, Call.PLACE) and is_post(call["post"]):
             post = np.zeros(1, POST_DTYPE)
             post[0] = call["post"]

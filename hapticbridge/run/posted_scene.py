@@ -27,9 +27,7 @@ from hapticbridge.kernel.record import PLANES, POST_DTYPE
 from hapticbridge.kernel.shown_tool import take_posted
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate_posted
-
-EVENT = "shown"
-"""Name of the event with the poses that were taken over since the last one."""
+from hapticbridge.recording.format import SHOWN_EVENT
 
 PATIENCE, PATIENT_PERIODS = 0.25, 5.0
 """Time in s without a post after which the force fades, and in periods of a slow program. A hand
@@ -90,7 +88,7 @@ class PostedScene:
         """Sentence for a user once the force is off for it; empty before the first post."""
         if not self._step[0]:
             return ""
-        return f"the program has shown no pose for {self.patience:g} s: the force is off until then"
+        return f"the program shows no pose for {self.patience:g} s: the force is off until it does"
 
     def exchange(self, _model: mujoco.MjModel, _data: mujoco.MjData) -> None:
         """Takes over a waiting post; it stands where other scenes have MuJoCo's step."""
@@ -155,7 +153,7 @@ def posts_in(events: Sequence[Mapping[str, Any]]) -> NDArray[np.void]:
 
 def _decoded(events: Sequence[Mapping[str, Any]]) -> Iterator[NDArray[np.void]]:
     for event in events:
-        if event.get("event") != EVENT:
+        if event.get("event") != SHOWN_EVENT:
             continue
         try:
             data = base64.b64decode(str(event.get("posts", "")), validate=True)
@@ -163,7 +161,7 @@ def _decoded(events: Sequence[Mapping[str, Any]]) -> Iterator[NDArray[np.void]]:
         except ValueError:
             posts = np.zeros(0, POST_DTYPE)
         if len(posts) != event.get("count") or not all(map(is_post, posts)):
-            raise RecordingError(f"event '{EVENT}' at tick {event.get('tick')!r} is damaged")
+            raise RecordingError(f"event '{SHOWN_EVENT}' at tick {event.get('tick')!r} is damaged")
         yield posts
 
 

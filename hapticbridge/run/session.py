@@ -54,6 +54,7 @@ from hapticbridge.realtime import (
     warn_of_refusals,
     warn_of_slow_motion,
 )
+from hapticbridge.recording.format import SHOWN_EVENT
 from hapticbridge.recording.recorder import RecordOutput, RecordStream
 from hapticbridge.recording.ring import Snapshot
 from hapticbridge.run.commands import CommandExecutor, CommandQueue, EventApplier
@@ -67,7 +68,6 @@ from hapticbridge.run.description import (
 )
 from hapticbridge.run.hands import DeviceGroup
 from hapticbridge.run.options import RunSetup
-from hapticbridge.run.posted_scene import EVENT as SHOWN_EVENT
 from hapticbridge.run.posted_scene import PostedScene
 from hapticbridge.run.request import RunRequest
 from hapticbridge.run.slow_scene import SlowScene

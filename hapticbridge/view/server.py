@@ -42,7 +42,7 @@ def serve(address: Address) -> viser.ViserServer:
     # viser would take the next free port instead
     if address.port and server.get_port() != address.port:
         stop(server)
-        raise HapticBridgeError(f"port {address.port} is in use; choose another with --port")
+        raise HapticBridgeError(f"port {address.port} is in use; choose another one")
     if not _is_guarded(server.get_port(), address):
         stop(server)
         raise HapticBridgeError(
