@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +103,32 @@ def test_the_wrench_makes_the_work_known_to_the_last_digit() -> None:
     assert stated == pytest.approx(work, rel=1e-9)
     assert gap < 2e-3
     assert credit > 0.04
+
+
+BALL = """<mujoco><worldbody><body gravcomp="1"><freejoint/>
+  <geom size=".02" mass=".2"/><site name="tip"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("is_renewed", [True, False])
+def test_a_wrench_at_the_pose_of_the_step_before_is_told(is_renewed: bool) -> None:
+    model = mujoco.MjModel.from_xml_string(BALL)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    tip, forces = data.site("tip").xpos, []
+    with (
+        DeviceLoop("simulated", is_simulated=True, scene_rate=500.0) as device,
+        nullcontext() if is_renewed else pytest.warns(UserWarning, match="mj_kinematics before"),
+    ):
+        device.show(tip)
+        for _ in range(3000):
+            if is_renewed:
+                mujoco.mj_kinematics(model, data)
+            data.xfrc_applied[1] = device.wrench(tip, data.qvel[:3])
+            forces.append(float(np.linalg.norm(data.xfrc_applied[1, :3])))
+            mujoco.mj_step(model, data)
+            device.advance(model.opt.timestep)
+    assert (max(forces) < 0.5) == is_renewed
+    assert device.summary["verdict"] == "passive"
 
 
 def test_a_handle_is_put_where_the_tool_is_put() -> None:

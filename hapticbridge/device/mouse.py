@@ -46,7 +46,7 @@ BUTTONS = 4
 
 
 class Drag(NamedTuple):
-    """Where the hand on the page is dragged.
+    """A drag of the hand on the page.
 
     Attributes:
         pose: Pose to go to.

@@ -8,6 +8,7 @@ import socket
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -43,6 +44,15 @@ ANSWER_TIME = 30.0
 REPEAT = 0.05
 """Time in s after which a call without an answer is sent again."""
 
+DOUBTFUL = 0.5
+"""Energy in J, beyond what the hand gave, from which on a program's wrench is doubtful."""
+
+UNPAID = (
+    f"the wrench has moved the tool by {DOUBTFUL:g} J that the hand did not give: the tool's pose "
+    "may be a step old (in MuJoCo, call mj_kinematics before wrench()), or the step too long for "
+    "so light a tool"
+)
+
 LONGEST_ADVANCE = 1e4
 """Longest simulated time in s of one call."""
 
@@ -56,8 +66,8 @@ class Handle(NamedTuple):
     Attributes:
         position: Position in m, (3,).
         quaternion: Orientation (w, x, y, z), (4,), w >= 0.
-        velocity: Velocity in m/s and rad/s, (6,), over the last 10 ms.
-        buttons: Bits of the buttons that are held.
+        velocity: Velocity in m/s and rad/s, (6,), over the last 10 ms, in the world frame.
+        buttons: Bits of the buttons that are held, the first one 1.
         grip: How far the device's grip axis is closed in m, as a gripper between the fingers; it
             is read, and gets no force. NaN without one.
         wrench: Force in N and torque in N m on the device, (6,), in its own frame.
@@ -113,7 +123,7 @@ class DeviceLoop:
     Args:
         device: A device as for ``hapticbridge run --device``, or ``remote:HOST:PORT`` for a loop
             that ``hapticbridge serve`` runs on another machine.
-        recording: File to write (``.mcap``), replaced if it is a recording.
+        recording: File to write (``.mcap``); a recording of that name is replaced.
         is_simulated: True for simulated time, which ``advance`` moves: equal in every run.
         python: Interpreter of the environment that has the loop; by default that of the variable
             HAPTICBRIDGE_PYTHON, else this one.
@@ -174,7 +184,7 @@ class DeviceLoop:
         self._heard = 0.0
         self._applied, self._shown = np.zeros(6), np.zeros(7)
         self._is_closed, self._placed = False, 0
-        self._is_stranger, self._is_absent = False, False
+        self._is_stranger = self._is_absent = self._has_warned = False
         self.summary: dict[str, Any] = {}
 
     def __enter__(self) -> Self:
@@ -266,7 +276,8 @@ class DeviceLoop:
 
         Args:
             pose: Pose of the tool at its grip.
-            velocity: Velocity of the grip in m/s and angular velocity in rad/s, (3,) or (6,).
+            velocity: Velocity of the grip in m/s and angular velocity in rad/s, (3,) or (6,), in
+                the world frame; a free joint's ``qvel`` has the angular part in the body's.
             surfaces: At most ``PLANES`` surfaces near the tool, at this pose.
             is_placed: True if the tool was put there, as by a reset of the scene: the handle is put
                 there, too, and the force begins anew.
@@ -289,7 +300,8 @@ class DeviceLoop:
         """Shows the tool, and returns the coupling's wrench on it, (6,) in N and N m.
 
         Apply it at the grip, in the world frame, until the next call. Its work on the tool is then
-        known, so that the hand feels what the tool feels:
+        known, so that the hand feels what the tool feels. The pose must be of this moment: after
+        ``mj_step`` a site's is one step old, and ``mj_kinematics`` renews it.
 
             f = K (h − x) + B (v_h − v), at most the force level;    W += f·δx + τ·δφ
 
@@ -316,7 +328,10 @@ class DeviceLoop:
             share = 0.0 if is_first else float(state["lever"])
             level, torque_level = state["levels"]
             self._applied = share * np.append(_within(force, level), _within(torque, torque_level))
-            post["work"] = self._call["post"]["work"] + work
+            post["work"] = total = self._call["post"]["work"] + work
+            if not self._has_warned and min(total[0], state["credit"]) < -DOUBTFUL:
+                self._has_warned = True
+                warnings.warn(UNPAID, stacklevel=2)
             self._shown, self._has_shown = own.copy(), True
             self._call["post"] = post
             self._send_pose(is_placed=is_first)

@@ -15,6 +15,7 @@ for uses_wrench in (True, False):
     with hb.DeviceLoop("simulated", recording="own_loop.mcap", is_simulated=True) as device:
         device.show(tip)
         for _ in range(1000):
+            mujoco.mj_kinematics(model, data)  # or the pose is that of the last step's start
             if uses_wrench:
                 data.xfrc_applied[1] = device.wrench(tip, velocity)
             else:
