@@ -1,5 +1,7 @@
 // C entry points to the loop on the board, for ctypes; and a hand that tries to gain energy from it.
+#include <deque>
 #include <random>
+#include <utility>
 #include <vector>
 
 static void noInterrupts() {}
@@ -68,6 +70,84 @@ void loop_report(const HbLoop* loop, double* works, float* poses) {
   works[4] = report.share;
   memcpy(poses, report.position, 12);
   memcpy(poses + 3, report.tool, 12);
+}
+
+// Lets a hand push a device against a wall at x = 0 and tap on it, through a link of some delay,
+// rendered by the loop on the board or by forces of the host. The device has a mass, damping,
+// Coulomb friction, and an encoder with steps. Returns in `found`: the largest travel in m of the
+// handle in the last half second, the most energy in J that the motor has given beyond what b burned,
+// the depth in m at the end, and the largest force in N.
+//
+// numbers: T, K, B, F, encoder's step, mass, b, f_c, delay of the link both ways, push in N
+void wall(const double* numbers, int is_on_board, double* found) {
+  const double period = numbers[0], stiffness = numbers[1], step = numbers[4], mass = numbers[5];
+  const double b = numbers[6], friction = numbers[7], delay = numbers[8], push = numbers[9];
+  const double substep = 2e-6, host_period = 1e-3, duration = 3.0;
+  const float setting[7] = {(float)stiffness, (float)numbers[2], (float)numbers[3], 0.0f, 0.0f,
+                            0.01f, 0.05f};
+  HbLoop loop((float)period);
+  loop.set(setting_of(setting, 1));
+  double x = 0.01, v = 0.0, motor = 0.0, given = 0.0, low = 1.0, high = -1.0;
+  float force[3] = {0.0f, 0.0f, 0.0f};
+  std::deque<std::pair<double, double> > seen, sent;  // times of arrival and numbers
+  double next_board = 0.0, next_host = 0.0, newest = x, last = x;
+  found[1] = found[3] = 0.0;
+  for (double time = 0.0; time < duration; time += substep) {
+    const double read = step > 0.0 ? step * std::round(x / step) : x;
+    if (time >= next_board) {
+      next_board += period;
+      if (is_on_board) {
+        const float position[3] = {(float)read, 0.0f, 0.0f};
+        loop.tick(position, force);
+        motor = force[0];
+      }
+    }
+    if (time >= next_host) {
+      next_host += host_period;
+      seen.push_back(std::make_pair(time + 0.5 * delay, read));
+      last = newest;
+      while (!seen.empty() && seen.front().first <= time) {
+        newest = seen.front().second;
+        seen.pop_front();
+      }
+      const double depth = newest < 0.0 ? -newest : 0.0;
+      const double wanted = std::min(stiffness * depth, numbers[3]);
+      sent.push_back(std::make_pair(time + 0.5 * delay, is_on_board ? newest : wanted));
+    }
+    while (!sent.empty() && sent.front().first <= time) {
+      const double news = sent.front().second;
+      sent.pop_front();
+      if (!is_on_board) {
+        motor = news;
+        continue;
+      }
+      HbShown shown;
+      memset(&shown, 0, sizeof shown);
+      shown.position[0] = (float)(news > 0.0 ? news : 0.0);
+      shown.velocity[0] = (float)((newest - last) / host_period);
+      shown.has_velocity = true;
+      shown.planes = 1;
+      shown.plane[0].normal[0] = 1.0f;
+      shown.plane[0].gap = shown.position[0];
+      loop.show(shown, false);
+    }
+    // a tap, then a push that stays
+    const double wanted = motor - push * (time < 0.5 ? 3.0 : 1.0) - b * v;
+    const double stop = mass * std::fabs(v + substep * wanted / mass) / substep;
+    const double drag = std::min(friction, stop);
+    v += substep * wanted / mass;
+    v -= (v > 0.0 ? 1.0 : -1.0) * substep * drag / mass;
+    x += substep * v;
+    given += (motor - b * v) * v * substep;
+    found[1] = std::max(found[1], given);
+    found[3] = std::max(found[3], motor);
+    if (time > duration - 0.5) {
+      low = std::min(low, x);
+      high = std::max(high, x);
+    }
+  }
+  found[0] = high - low;
+  found[2] = -x;
 }
 
 // A whole board of 10 kHz, which a host knows by its frames alone.

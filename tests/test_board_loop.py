@@ -248,6 +248,55 @@ def test_without_tank_or_damping_hands_are_seen_to_gain(
     assert max(gained(library, seed, **change) for seed in range(100)) > 0.01
 
 
+# A stiff wall behind a slow link, on a device of 0.1 kg, 2 N s/m, 0.1 N and 10 µm
+
+SETTLED = 1e-5
+"""Largest travel in m in the last half second of a hand that rests on a wall: a step."""
+
+
+def at_wall(library: ctypes.CDLL, stiffness: float, **changes: float) -> NDArray[np.float64]:
+    """Returns travel, energy beyond what b burned, depth and force of a tap and a push of 1 N."""
+    numbers = {
+        "period": PERIOD,
+        "stiffness": stiffness,
+        "damping": 0.0,
+        "level": 10.0,
+        "step": 1e-5,
+        "mass": 0.1,
+        "b": 2.0,
+        "friction": 0.1,
+        "delay": 2e-3,
+        "push": 1.0,
+        "is_on_board": 1.0,
+    } | changes
+    is_on_board = int(numbers.pop("is_on_board"))
+    values, found = (ctypes.c_double * len(numbers))(*numbers.values()), (ctypes.c_double * 4)()
+    library.wall(values, is_on_board, found)
+    return np.array(found)
+
+
+def test_a_stiff_wall_on_the_board_gives_nothing_and_rests(library: ctypes.CDLL) -> None:
+    # b >= KT/2 = 0.75 N s/m, and friction >= K step/2 = 0.075 N
+    travel, gained, depth, force = at_wall(library, 15e3)
+    assert travel < SETTLED
+    assert gained < 1e-9
+    assert depth == pytest.approx(1.0 / 15e3, abs=1e-5)
+    assert 3.0 < force < 10.0
+    travel, *_ = at_wall(library, 15e3, b=0.3, friction=0.0)
+    assert travel > 10.0 * SETTLED  # a device that does not meet the condition is seen to swing
+
+
+def test_the_hosts_own_loop_bears_a_soft_one_behind_the_same_link(library: ctypes.CDLL) -> None:
+    travel, gained, depth, _ = at_wall(library, 967.0, is_on_board=0.0)
+    assert travel < SETTLED
+    assert gained < 1e-9
+    assert depth == pytest.approx(1.0 / 967.0, abs=2e-4)
+    for stiffness in (2e3, 15e3):
+        travel, gained, *_ = at_wall(library, stiffness, is_on_board=0.0)
+        assert travel > 1e-3
+        assert gained > 0.01
+
+
 # Ends of the force
 
 
