@@ -333,12 +333,17 @@ def test_a_datagram_without_the_token_or_of_another_kind_is_dropped() -> None:
 
 
 @contextmanager
-def endpoint_of(device: Any) -> Iterator[str]:
-    """Runs a loop in simulated time in this process, and yields its remote name."""
+def endpoint_of(device: Any, news: list[object] | None = None) -> Iterator[str]:
+    """Runs a loop in simulated time in this process, and yields its remote name.
+
+    ``news`` gets True for each program that takes the loop over and False for any other one, and
+    the reason of each that leaves.
+    """
+    news = [] if news is None else news
     clock = GrantedClock()
     options = program_options(BridgeOptions())
     with Bridge(posted_scene(0.05), device, None, options, clock=clock) as bridge:
-        endpoint = Endpoint("127.0.0.1", 0, TOKEN.encode())
+        endpoint = Endpoint("127.0.0.1", 0, TOKEN.encode(), news.append, news.append)
         endpoint.open(bridge)
         run = threading.Thread(target=bridge.run)
         run.start()
@@ -351,8 +356,9 @@ def endpoint_of(device: Any) -> Iterator[str]:
 
 
 def test_a_program_that_starts_anew_has_the_loop_and_the_other_is_told() -> None:
+    news: list[object] = []
     with (
-        endpoint_of("simulated") as name,
+        endpoint_of("simulated", news) as name,
         DeviceLoop(name, token=TOKEN) as first,
         DeviceLoop(name, token=TOKEN) as second,
     ):
@@ -369,6 +375,10 @@ def test_a_program_that_starts_anew_has_the_loop_and_the_other_is_told() -> None
             assert last.pose().position == pytest.approx([0.3, 0.0, 0.0], abs=1e-3)
             first.close()  # a farewell of a program without the loop ends nothing
             last.advance(0.01)
+        end = time.monotonic() + 10.0
+        while len(news) < 4 and time.monotonic() < end:
+            time.sleep(0.01)
+        assert news == [False, True, True, "program"]
 
 
 def test_a_grip_axis_is_read_and_gets_no_force() -> None:

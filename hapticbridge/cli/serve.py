@@ -40,6 +40,10 @@ from hapticbridge.signals import interrupting_on_signals
 LOOK = 0.5
 """Time in s between two looks whether the program that started the loop still lives."""
 
+BEGINS, LEAVES = "a program has begun", "the program has left; the next one may begin"
+TAKES_OVER = "another program has begun, and taken the loop over"
+"""Sentences on programs that come and go."""
+
 GONE = "program that was killed"
 """Reason of a stop, in the recording."""
 
@@ -127,7 +131,13 @@ class Serve:
                 warn_of_conditions(bridge.setup)
             else:
                 announce(bridge.setup, self.coupling, is_method_chosen=False)
-            endpoint = Endpoint(self.host, self.port, token.encode(), self._on_leave(bridge, clock))
+            endpoint = Endpoint(
+                self.host,
+                self.port,
+                token.encode(),
+                self._on_leave(bridge, clock),
+                lambda has_taken_over: self._say(TAKES_OVER if has_taken_over else BEGINS),
+            )
             with working("rehearsing the start of the run"):
                 stack.enter_context(bridge)
             interrupts.hand_over(bridge.stop_on_signal)
@@ -153,12 +163,17 @@ class Serve:
         """Returns what is done when the program leaves, with the reason."""
 
         def leave(reason: str) -> None:
+            self._say(LEAVES)
             if self.as_json:
                 bridge.stop(reason)
                 if isinstance(clock, GrantedClock):
                     clock.release()
 
         return leave
+
+    def _say(self, words: str) -> None:
+        if not self.as_json:
+            notify(words)
 
     def _tell(self, endpoint: Endpoint, token: str) -> None:
         host, port = endpoint.address

@@ -110,6 +110,10 @@ def program_options(options: BridgeOptions) -> BridgeOptions:
     return replace(options, method=PROGRAM_METHOD, scene_rate=rate)
 
 
+def ignore(_news: object) -> None:
+    """Does nothing with what happens at an endpoint."""
+
+
 class GrantedClock(SimulatedClock):
     """Simulated time that stands still until ticks are granted.
 
@@ -160,6 +164,7 @@ class Endpoint:
         port: Port; 0 takes any free one.
         token: Token that the program must have.
         on_leave: Called with a reason when the program leaves.
+        on_begin: Called when a program begins, with True if it has taken the loop over.
 
     Attributes:
         address: Host and port.
@@ -169,7 +174,12 @@ class Endpoint:
     """
 
     def __init__(
-        self, host: str, port: int, token: bytes, on_leave: Callable[[str], None] | None = None
+        self,
+        host: str,
+        port: int,
+        token: bytes,
+        on_leave: Callable[[str], None] = ignore,
+        on_begin: Callable[[bool], None] = ignore,
     ) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
@@ -181,7 +191,7 @@ class Endpoint:
                 f"port {port} of '{host}' cannot be used: {error.strerror}"
             ) from None
         self.address: tuple[str, int] = self._socket.getsockname()[:2]
-        self._token, self._on_leave = token, on_leave
+        self._token, self._on_leave, self._on_begin = token, on_leave, on_begin
         self._peer: Any = None
         self._calls: dict[int, int] = {}  # of each program, the number of its newest call
         self._placed = 0, 0  # number of the call, and tick after which it is done
@@ -263,7 +273,8 @@ class Endpoint:
         self._peer = peer
         if kind == Call.ADVANCE and isinstance(self._bridge.clock, GrantedClock):
             self._bridge.clock.grant(max(int(call["ticks"]), 1), number)
-        elif kind == Call.LEAVE and self._on_leave is not None:
+        elif kind == Call.LEAVE:
+            self._peer = None
             self._on_leave(FAILED if call["ticks"] else LEFT)
         elif kind in (Call.SHOW, Call.PLACE) and is_post(call["post"]):
             post = np.zeros(1, POST_DTYPE)
@@ -280,6 +291,7 @@ class Endpoint:
 
     def _begin(self, program: int) -> None:
         """Counts calls, placed tools and granted time from 0 for a new program."""
+        self._on_begin(self._peer is not None)
         self._told["program"], self._told["placed"], self._placed = program, 0, (0, 0)
         if isinstance(self._bridge.clock, GrantedClock):
             self._bridge.clock.begin()
