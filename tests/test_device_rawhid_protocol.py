@@ -405,8 +405,26 @@ def test_the_sketch_pushes_as_told_and_its_interrupt_lets_go(sketch: ctypes.CDLL
     assert sketch.sketch_pin(PWM) == 0
 
 
+def test_the_sketch_renders_a_wall_by_itself(sketch: ctypes.CDLL) -> None:
+    sketch.sketch_send(protocol.setting_frame(1, protocol.LoopSetting(5e3, 0.0, 2.0, 0.0, 0.01)))
+    wall = (((1.0, 0.0, 0.0), 0.0),)
+    for sequence in range(2, 7):
+        tool = protocol.ShownTool((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, wall)
+        sketch.sketch_send(protocol.show_frames(sequence, tool, 50)[0])
+        sketch.sketch_run(10_000, 1)
+        sketch.sketch_turn(-10 * (sequence > 3))
+    force = 5e3 * 10 * 0.070 * 0.005 / 0.075 * 2.0 * math.pi / 2000
+    duty = force * 0.070 * 0.005 / 0.075 / 0.0136 * 2.5 / 12.0
+    assert sketch.sketch_pin(PWM) == pytest.approx(1023 * duty, abs=1)
+    assert sketch.sketch_pin(DIRECTION) == 1
+    sketch.sketch_run(35_000, 0)  # loop() hangs: the interrupt renders it until patience ends
+    assert sketch.sketch_pin(PWM) == pytest.approx(1023 * duty, abs=1)
+    sketch.sketch_run(25_000, 0)
+    assert sketch.sketch_pin(PWM) == 0
+
+
 def test_what_the_sketch_does_with_interrupts_off_keeps_them_off(sketch: ctypes.CDLL) -> None:
     sketch.sketch_send(protocol.force_frame(1, WRENCH, 20))
     sketch.sketch_run(1_010 * 3 + 10, 1)
-    assert sketch.sketch_sections() == 4  # a force frame, three states
+    assert sketch.sketch_sections() == 7  # a force frame, and two for each of three states
     assert sketch.sketch_broken_sections() == 0

@@ -1,8 +1,11 @@
-// A one-axis haptic device for hapticbridge on a Teensy 3.2, 3.6, 4.0 or 4.1: a paddle on a capstan
+// A one-axis haptic device for hapticbridge on a Teensy 3.5, 3.6, 4.0 or 4.1: a paddle on a capstan
 // drive (as on the Hapkit), a quadrature encoder on the motor, and a driver with a PWM and a
-// direction pin.
+// direction pin. It follows the host's forces, or runs a loop of its own at 10 kHz for a host that
+// shows its tool. A board without a floating-point unit is too slow for that loop: give it an
+// HbDevice in the place of the HbBoard, as hapticbridge_serial.ino has it.
 //
-// Tools > USB Type > Raw HID. Files: this sketch, hb_constants.h, hb_loop.h, hb_protocol.h and hb_protocol.cpp in one folder.
+// Tools > USB Type > Raw HID. Files: this sketch and the four of the name hb_*.h and hb_protocol.cpp
+// in one folder.
 // Needs only Teensyduino (its Encoder library and IntervalTimer). Then, on the computer:
 //
 //   hapticbridge devices
@@ -19,7 +22,7 @@
 #include <math.h>
 #include <string.h>
 
-#include "hb_protocol.h"
+#include "hb_board.h"
 
 // ======================================================================== your device, part 1: facts
 
@@ -43,7 +46,7 @@ const float TRAVEL = HANDLE * MOTOR_PULLEY / SECTOR;
 const float STEP = TRAVEL * 6.2831853f / COUNTS_PER_TURN;
 
 const uint32_t STATE_PERIOD_US = 1010;  // see send_state() before you make it shorter
-const uint32_t CONTROL_PERIOD_US = 500;
+const uint32_t CONTROL_PERIOD_US = 100;       // of the loop on the board; it takes about 10
 
 HbSheet my_sheet() {
   HbSheet sheet;
@@ -59,7 +62,6 @@ HbSheet my_sheet() {
   sheet.torque_limit = NAN;  // it does not turn
   sheet.speed_limit = 2.0f;  // m/s, faster than a hand moves it
   sheet.delay = 1e-6f * CONTROL_PERIOD_US;
-  sheet.loop_rate = 0.0f;  // no loop of its own
   sheet.name = "one-axis capstan paddle";
   return sheet;
 }
@@ -79,10 +81,13 @@ void motor_setup() {
   encoder.write(0);  // the pose at power-on is x = 0: hold the paddle upright
 }
 
-// Applies a force at the handle by the motor. Called from an interrupt, 2000 times a second, and
-// with zero after the watchdog has expired: it must not wait, print or allocate.
-void motor_write(const HbWrench& wrench) {
-  const float torque = wrench.force[0] * TRAVEL;
+// Reads the handle's position in m. Called from the interrupt, once per period of the loop.
+void read_position(float position[3]) { position[0] = STEP * (float)encoder.read(); }
+
+// Applies a force in N at the handle by the motor. Called from the interrupt, with zero where there
+// is to be none: it must not wait, print or allocate.
+void write_force(const float force[3]) {
+  const float torque = force[0] * TRAVEL;
   float duty = torque / TORQUE_CONSTANT * RESISTANCE / SUPPLY;
   is_saturated = fabsf(duty) > DUTY_LIMIT;
   if (duty > DUTY_LIMIT) duty = DUTY_LIMIT;
@@ -94,7 +99,7 @@ void motor_write(const HbWrench& wrench) {
 // Reads the handle's motion. Called from loop(), once per state frame.
 void motion_read(HbMotion& motion) {
   static float last = 0.0f;
-  motion.position[0] = STEP * (float)encoder.read();
+  read_position(motion.position);
   motion.velocity[0] = (motion.position[0] - last) / (1e-6f * STATE_PERIOD_US);
   last = motion.position[0];
   motion.buttons = PIN_BUTTON != 255 && digitalRead(PIN_BUTTON) == LOW ? 1 : 0;
@@ -104,22 +109,17 @@ void motion_read(HbMotion& motion) {
 
 // ========================================================================= protocol: do not change
 
-HbDevice device(my_sheet());  // used by loop() only
-HbCommand command;            // copy of the command for control_tick()
+HbBoard board(my_sheet(), 1e-6f * CONTROL_PERIOD_US);
 IntervalTimer control;
 
-// Runs in an interrupt, so that a loop() that hangs cannot leave a force on the motor: no force
-// frame is received then, and the watchdog of the last one expires here. A processor that has
-// stopped keeps its PWM: if your driver has an enable input, drive it by a hardware watchdog.
-void control_tick() { motor_write(command.wrench(micros())); }
-
-// Copies the command for control_tick(), with interrupts off for about a microsecond. Checking a
-// frame takes some 40 on a Teensy 3.2; with interrupts off for so long the encoder would lose edges.
-// Do not call micros() in between: on a Teensy 3 it switches interrupts on again.
-void pass_on() {
-  noInterrupts();
-  command = device.command();
-  interrupts();
+// Runs in an interrupt, so that a loop() that hangs cannot leave a force on the motor: no frame is
+// received then, and the patience of the last one ends here. A processor that has stopped keeps its
+// PWM: if your driver has an enable input, drive it by a hardware watchdog.
+void control_tick() {
+  float position[3] = {0.0f, 0.0f, 0.0f}, force[3];
+  read_position(position);
+  board.tick(position, micros(), force);
+  write_force(force);
 }
 
 void setup() {
@@ -139,17 +139,15 @@ void send_state(uint32_t now_us) {
   memset(&motion, 0, sizeof motion);
   motion_read(motion);
   uint8_t frame[HB_FRAME_BYTES];
-  device.state(motion, now_us, frame);
-  pass_on();  // a fault ends the force
+  board.state(motion, now_us, frame);
   RawHID.send(frame, 0);
 }
 
 void loop() {
   uint8_t frame[HB_FRAME_BYTES];
   while (RawHID.recv(frame, 0) > 0) {
-    device.receive(frame, micros());
-    pass_on();
-    if (device.answer(frame)) RawHID.send(frame, 100);
+    board.receive(frame, micros());
+    if (board.answer(frame)) RawHID.send(frame, 100);
   }
   send_state(micros());
 }
