@@ -267,6 +267,7 @@ class YieldingHand:
         )
         self.got, self._net, self._share, self._begin = 0.0, 0.0, share, begin
         self._place, self._tick, self._forces = 0.0, 0, [0.0] * (delay + 1)
+        self._buttons = 0
 
     def start(self, period: float) -> NDArray[np.void]:
         self._period, sample = period, np.zeros(1, SAMPLE_DTYPE)
@@ -275,14 +276,17 @@ class YieldingHand:
 
     def read(self, sample: NDArray[np.void]) -> int:
         force, b = self._forces[0], 2.0
-        if self._tick > self._begin:
-            speed = float(np.clip(self._share * force / b, -3.0, 3.0))
-            self._place += speed * self._period
-            self._net += (force - b * speed) * speed * self._period
-            self.got = max(self.got, self._net)
+        speed = float(np.clip(self._speed(force), -3.0, 3.0))
+        self._place += speed * self._period
+        self._net += (force - b * speed) * speed * self._period
+        self.got = max(self.got, self._net)
         self._tick += 1
         sample["position"][0], sample["quaternion"][0] = (self._place, 0.0, 0.0), UPRIGHT
+        sample["buttons"] = self._buttons
         return 0
+
+    def _speed(self, force: float) -> float:
+        return 0.5 * self._share * force if self._tick > self._begin else 0.0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         self._forces = [*self._forces[1:], float(wrench[0])]
@@ -291,15 +295,35 @@ class YieldingHand:
         pass
 
 
+class ClutchingHand(YieldingHand):
+    """Stretches the coupling, taps its clutch 20 times, and lets the spring go slowly.
+
+    While the force fades and rises it moves with what a late force is more than the newest one.
+    """
+
+    def _speed(self, force: float) -> float:
+        tick = self._tick - self._begin
+        phase = tick % 100
+        self._buttons = int(0 <= tick < 2000 and phase < 18)  # no longer than the fade
+        if tick < 0:
+            return -0.05 / (self._begin * self._period)
+        if tick >= 2000:
+            return 0.01 * force
+        if phase >= 30:
+            return (-0.05 - self._place) / ((100 - phase) * self._period)
+        return 0.25 * (force - self._forces[-1])
+
+
 def got_from(program: Program, hand: YieldingHand, stiffness: float, **options: Any) -> float:
     """Returns the energy in J that a hand got."""
+    duration = options.pop("duration", 3.0)
     own = program_options(BridgeOptions(**options))
     coupling = {"stiffness": stiffness, "damping": 0.0}
     scene = posted_scene(CREDIT)
     with Bridge(scene, hand, coupling, own, clock=SimulatedClock()) as bridge:
         if program is unpaid:
             bridge.session.kernel.state["shown"]["tank"] = 1e9
-        bridge.run(3.0, lambda tick: program(bridge, tick))
+        bridge.run(duration, lambda tick: program(bridge, tick))
     return hand.got
 
 
@@ -318,6 +342,16 @@ def unpaid(bridge: Bridge, tick: int) -> None:
 def test_a_force_that_arrives_after_a_jump_of_the_tool_gives_no_more_than_the_credit() -> None:
     assert got_from(jumps, YieldingHand(delay=1, begin=0), 980.0) <= CREDIT + UNPAID
     assert got_from(unpaid, YieldingHand(delay=1, begin=0), 980.0) > 10.0
+
+
+def test_a_late_force_gives_nothing_while_it_fades_and_rises() -> None:
+    """Without a charge for it 0.19 J were got from a tool that never moves."""
+
+    def holds(bridge: Bridge, tick: int) -> None:
+        if tick % 20 == 0:
+            shows(bridge, post_of((0.0, 0.0, 0.0)))
+
+    assert got_from(holds, ClutchingHand(delay=1), 850.0, clutch=0, duration=6.0) <= UNPAID
 
 
 @pytest.mark.parametrize("force_scale", [0.5, 1.0, 3.0])

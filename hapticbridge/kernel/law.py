@@ -40,7 +40,7 @@ from hapticbridge.kernel.handle import (
 from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.ledger import SLACK_SHARE, moment_dot
 from hapticbridge.kernel.mujoco_c import floats
-from hapticbridge.kernel.parameters import ALL_MOTORS, RunParameters
+from hapticbridge.kernel.parameters import ALL_MOTORS, RunParameters, whole_ticks
 from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
@@ -74,6 +74,9 @@ TUNED = (*_LAW, *_SLACK)
 
 _TUNED_DTYPE = np.dtype([*((name, "<f8") for name in TUNED), ("gains", "<f8", 6)])
 
+SENT = 64
+"""Ticks of which lever and wrench are kept; a device is at most 50 samples late."""
+
 COUPLING_DTYPE = np.dtype(
     [
         *((name, "<f8") for name in TUNED),
@@ -82,8 +85,10 @@ COUPLING_DTYPE = np.dtype(
         ("tuning_ticks", "<i8"),  # ticks left until the goal is reached
         ("lacks_motors", "<i8"),
         ("lacks_motor", "<f8", 6),  # 1 for an axis of the device without motor
-        ("owed", "<f8", 2),  # energy in J that late samples have put into the springs
+        ("owed", "<f8", 2),  # energy in J that late samples and forces have put into the springs
         ("tool_then", "<f8", 7),  # tool's pose after the tick of the device's last new sample
+        ("late_ticks", "<i8"),  # d, ticks from a sample to its force
+        ("sent", "<f8", (SENT, 7)),  # lever and wrench on the tool of the last ticks
         ("hold", "<f8", 2),
         ("idle", "<f8", 2),
         ("twist_damping", "<f8"),
@@ -154,6 +159,8 @@ def bind_coupling(coupling: Part, parameters: RunParameters, gains: tuple[float,
     coupling["hold"] = guarding.hold_force, guarding.hold_torque
     coupling["idle"] = guarding.idle_force, guarding.idle_torque
     coupling["twist_damping"] = guarding.twist_damping * parameters.scale / parameters.force_scale
+    late = whole_ticks(guarding.stated_delay, parameters.period)
+    coupling["late_ticks"] = min(late, SENT - 1)
 
 
 def set_tuning_goal(
@@ -554,6 +561,49 @@ def charge_lateness(s: State, interval: float, ticks: int) -> None:
 
 
 @compiled
+def note_sent(s: State) -> None:
+    """Notes lever and wrench on the tool of the present tick."""
+    sent, wrench = s.coupling.sent[s.loop.tick % SENT], s.loop.wrench_on_tool
+    sent[0] = s.guard.lever
+    for i in range(6):
+        sent[1 + i] = wrench[i]
+
+
+def forget_sent(coupling: Part) -> None:
+    """Forgets the wrenches on their way to the device: it holds none, or the springs are empty."""
+    coupling["sent"] = 0.0
+
+
+@compiled
+def charge_lag(s: State, lever: float, moved: Vector, turned: Vector) -> None:
+    """Charges the springs with what a late force gives while the lever r changes.
+
+        Z_k = max_j (r_{k−1} − r_{k−1−j}) f_{k−1−j}·scale A δp_k,    j = 0 … d
+
+    The handle moves by r_{k−1} times the device's motion δp in m, and the device still holds the
+    force r_{k−1−j} f_{k−1−j}, sent j ticks before. Rotation alike, with the torque and δφ in rad.
+    Otherwise a hand that moves with the force in each fade gets (T/4b) (Δr F)² a tick for nothing.
+
+    Args:
+        s: The bound state.
+        lever: r_{k−1}.
+        moved: δp in the device's frame.
+        turned: δφ in the device's frame.
+    """
+    k = s.coupling
+    way = scaled(s.run.scale, scene_from_device(s.run.axes, moved))
+    turn = scene_from_device(s.run.axes, turned)
+    most = most_r = 0.0
+    for j in range(1, k.late_ticks + 1):
+        sent = k.sent[(s.loop.tick - 1 - j) % SENT]
+        change = lever - sent[0]
+        most = max(most, change * dot(vector_of(sent[1:4]), way))
+        most_r = max(most_r, change * dot(vector_of(sent[4:7]), turn))
+    k.owed[0] += most
+    k.owed[1] += most_r
+
+
+@compiled
 def _paid(spring: Spring, length: float, owed: float) -> tuple[float, float]:
     """Returns the length at which a spring has paid what it owes, and what is left to pay."""
     energy = spring_energy(spring, length)
@@ -578,7 +628,8 @@ def felt(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
 def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     """Slips the handle toward the tool, where the spring holds more than it may.
 
-    Four things make it slip. A late sample is charged (``charge_lateness``). A raised gain must not
+    Four things make it slip. A late sample or force is charged (``charge_lateness``,
+    ``charge_lag``). A raised gain must not
     raise the spring's energy. Along an axis without motor the coupling holds up to ``hold`` and
     then slips. While the hand is let go it relaxes to ``idle``. Each only shortens the spring, so
     energy is lost and none is gained.
