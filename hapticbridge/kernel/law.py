@@ -577,7 +577,7 @@ def forget_sent(coupling: Part) -> None:
 
 
 @compiled
-def charge_lag(s: State, lever: float, moved: Vector, turned: Vector) -> None:
+def charge_lag(s: State, lever: float, ticks: int, moved: Vector, turned: Vector) -> None:
     """Charges the springs with what a late wrench gives beside the law's own delay.
 
         Z_k = max_j (r_{k−1} − r_{k−1−j}) f_{k−1−j}·scale A δp_k,    j = 0 … d
@@ -585,13 +585,15 @@ def charge_lag(s: State, lever: float, moved: Vector, turned: Vector) -> None:
 
     The handle moves by r_{k−1} times the device's motion δp in m and δφ in rad. The device still
     holds the wrench of j ticks before, with the lever r of that time, and a torque in the direction
-    of that time. Q_j is the mean turn of handle and tool since then, with which the torque of a
-    coupling turns. Otherwise a hand gets (T/4b) (Δr F)² a tick for nothing while the force fades,
-    and a hand that wobbles about a twist, with a tool that follows, up to τ Σ_j sin(jθ) ‖δφ‖².
+    of that time. d counts the ticks of its delay, and those in which a slow device gave no sample.
+    Q_j is the mean turn of handle and tool since then, with which the torque of a coupling turns.
+    Otherwise a hand gets (T/4b) (Δr F)² a tick for nothing while the force fades, and a hand that
+    wobbles about a twist, with a tool that follows, up to τ Σ_j sin(jθ) ‖δφ‖².
 
     Args:
         s: The bound state.
         lever: r_{k−1}.
+        ticks: Ticks since the last new sample.
         moved: δp in the device's frame.
         turned: δφ in the device's frame.
     """
@@ -599,8 +601,10 @@ def charge_lag(s: State, lever: float, moved: Vector, turned: Vector) -> None:
     way = scaled(s.run.scale, scene_from_device(s.run.axes, moved))
     turn = scene_from_device(s.run.axes, turned)
     most = most_r = 0.0
-    since = (0.0, 0.0, 0.0)
-    for j in range(1, k.late_ticks + 1):
+    since, late = (0.0, 0.0, 0.0), k.late_ticks
+    if ticks <= s.guard.stale_ticks:  # after a longer silence the force has faded
+        late = min(late + ticks - 1, SENT - 1)
+    for j in range(1, late + 1):
         since = add(since, vector_of(k.sent[(s.loop.tick - j) % SENT][7:10]))
         sent = k.sent[(s.loop.tick - 1 - j) % SENT]
         most = max(most, (lever - sent[0]) * dot(vector_of(sent[1:4]), way))

@@ -252,7 +252,7 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
     is_timed = s.run.has_law and s.guard.has_hand and s.loop.tick > s.guard.start_tick
     if is_timed:
         charge_lateness(s, interval, ticks)
-        charge_lag(s, lever, moved, turned)
+        charge_lag(s, lever, ticks, moved, turned)
     else:
         note_tool(s)
     if s.mj.metered_mocaps > 0 and s.run.scheme != Scheme.SHOWN:
