@@ -309,6 +309,13 @@ class YieldingHand:
         pass
 
 
+class PullingHand(YieldingHand):
+    """Pulls at 0.2 m/s."""
+
+    def _speed(self, force: float) -> float:
+        return 0.2
+
+
 class ClutchingHand(YieldingHand):
     """Stretches the coupling, taps its clutch 20 times, and lets the spring go slowly.
 
@@ -435,6 +442,20 @@ def test_a_work_that_is_stated_and_taken_back_fills_no_tank() -> None:
 
     _, records = run(lies, device="simulated:hand=none", duration=0.5)
     assert np.all(records["scene_tank"] <= CREDIT)
+
+
+def test_a_program_that_shows_in_every_tick_has_no_larger_tank() -> None:
+    """Without a cap in the tick of a post it held 2 J instead of 1 J after six seconds."""
+    tanks: dict[int, float] = {}
+    for every in (1, 2):
+
+        def drags(bridge: Bridge, tick: int, every: int = every) -> None:
+            if tick % every == 0:
+                shows(bridge, post_of(handle_of(bridge) - (0.004, 0.0, 0.0), has_velocity=1))
+
+        _, records = run(drags, device=PullingHand(), duration=6.0)
+        tanks[every] = float(records["scene_tank"].max())
+    assert tanks[1] == pytest.approx(tanks[2], rel=0.01)
 
 
 def test_normals_of_another_length_are_no_post() -> None:
