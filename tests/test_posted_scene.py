@@ -9,20 +9,26 @@ from typing import Any
 
 import numpy as np
 import pytest
-from adversary import UNPAID, Attack
+from adversary import UNPAID, Attack, turn
 from numpy.typing import NDArray
 
 from hapticbridge import Bridge, BridgeOptions, SimulatedClock, Summary, Workspace, audit
 from hapticbridge.audit import AuditReport
+from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import method_named, prepare
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.record import POST_DTYPE, SAMPLE_DTYPE
+from hapticbridge.kernel.parameters import GuardParameters, RunParameters
+from hapticbridge.kernel.record import POST_DTYPE, SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import posted_tick
 from hapticbridge.recording import read_recording
 from hapticbridge.recording.format import SHOWN_EVENT
 from hapticbridge.run.commands import Couple, Repeat, Reset, Switch
 from hapticbridge.run.endpoint import posted_scene, program_options
 from hapticbridge.run.posted_scene import is_post
+from hapticbridge.theory.bounds import minimum_damping
 
 CREDIT = 0.05
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -264,7 +270,9 @@ class YieldingHand:
     ``got`` is the largest energy in J so far that the force gave beyond what b burned.
     """
 
-    def __init__(self, delay: int = 0, share: float = 0.5, begin: int = 400) -> None:
+    def __init__(
+        self, delay: int = 0, share: float = 0.5, begin: int = 400, every: int = 1
+    ) -> None:
         self.info = DeviceInfo(
             name="yielding",
             axes=("x",),
@@ -276,9 +284,12 @@ class YieldingHand:
             delay=1e-3 * delay,
             is_delay_measured=True,
             is_real=False,
+            rate=1000.0 / every,
         )
+        self._every, self._newest = every, 0.0
         self.got, self._net, self._share, self._begin = 0.0, 0.0, share, begin
         self._place, self._tick, self._forces = 0.0, 0, [0.0] * (delay + 1)
+        self._buttons = 0
 
     def start(self, period: float) -> NDArray[np.void]:
         self._period, sample = period, np.zeros(1, SAMPLE_DTYPE)
@@ -287,31 +298,65 @@ class YieldingHand:
 
     def read(self, sample: NDArray[np.void]) -> int:
         force, b = self._forces[0], 2.0
-        if self._tick > self._begin:
-            speed = float(np.clip(self._share * force / b, -3.0, 3.0))
-            self._place += speed * self._period
-            self._net += (force - b * speed) * speed * self._period
-            self.got = max(self.got, self._net)
+        speed = float(np.clip(self._speed(force), -3.0, 3.0))
+        self._place += speed * self._period
+        self._net += (force - b * speed) * speed * self._period
+        self.got = max(self.got, self._net)
         self._tick += 1
+        sample["buttons"] = self._buttons
+        if self._tick % self._every:
+            return int(TickFlag.STALE_SAMPLE)
         sample["position"][0], sample["quaternion"][0] = (self._place, 0.0, 0.0), UPRIGHT
         return 0
 
+    def _speed(self, force: float) -> float:
+        return 0.5 * self._share * force if self._tick > self._begin else 0.0
+
     def write(self, wrench: NDArray[np.float64]) -> None:
-        self._forces = [*self._forces[1:], float(wrench[0])]
+        self._newest = float(wrench[0])
+        if self._tick % self._every == 0:
+            self._forces = [*self._forces[1:], self._newest]
 
     def close(self) -> None:
         pass
 
 
+class PullingHand(YieldingHand):
+    """Pulls at 0.2 m/s."""
+
+    def _speed(self, force: float) -> float:
+        return 0.2
+
+
+class ClutchingHand(YieldingHand):
+    """Stretches the coupling, taps its clutch 20 times, and lets the spring go slowly.
+
+    While the force fades and rises it moves with what a late force is more than the newest one.
+    """
+
+    def _speed(self, force: float) -> float:
+        tick = self._tick - self._begin
+        phase = tick % 100
+        self._buttons = int(0 <= tick < 2000 and phase < 18)  # no longer than the fade
+        if tick < 0:
+            return -0.05 / (self._begin * self._period)
+        if tick >= 2000:
+            return 0.01 * force
+        if phase >= 30:
+            return (-0.05 - self._place) / ((100 - phase) * self._period)
+        return 0.25 * (force - self._newest)
+
+
 def got_from(program: Program, hand: YieldingHand, stiffness: float, **options: Any) -> float:
     """Returns the energy in J that a hand got."""
+    duration = options.pop("duration", 3.0)
     own = program_options(BridgeOptions(**options))
     coupling = {"stiffness": stiffness, "damping": 0.0}
     scene = posted_scene(CREDIT)
     with Bridge(scene, hand, coupling, own, clock=SimulatedClock()) as bridge:
         if program is unpaid:
             bridge.session.kernel.state["shown"]["tank"] = 1e9
-        bridge.run(3.0, lambda tick: program(bridge, tick))
+        bridge.run(duration, lambda tick: program(bridge, tick))
     return hand.got
 
 
@@ -330,6 +375,62 @@ def unpaid(bridge: Bridge, tick: int) -> None:
 def test_a_force_that_arrives_after_a_jump_of_the_tool_gives_no_more_than_the_credit() -> None:
     assert got_from(jumps, YieldingHand(delay=1, begin=0), 980.0) <= CREDIT + UNPAID
     assert got_from(unpaid, YieldingHand(delay=1, begin=0), 980.0) > 10.0
+
+
+@pytest.mark.parametrize(("late", "stiffness"), [({"delay": 1}, 850.0), ({"every": 4}, 212.0)])
+def test_a_late_force_gives_nothing_while_it_fades_and_rises(
+    late: dict[str, int], stiffness: float
+) -> None:
+    """Without a charge for it 0.19 and 0.13 J were got from a tool that never moves."""
+
+    def holds(bridge: Bridge, tick: int) -> None:
+        if tick % 20 == 0:
+            shows(bridge, post_of((0.0, 0.0, 0.0)))
+
+    options: dict[str, Any] = {"clutch": 0, "duration": 6.0, "rate": 1000.0}
+    assert got_from(holds, ClutchingHand(**late), stiffness, **options) <= UNPAID
+
+
+def test_a_late_torque_gives_nothing_to_a_hand_that_wobbles_about_a_twist() -> None:
+    """The torque of a coupling turns with the hand, a late one does not; 0.5 J were got so."""
+    law, period = Coupling(100.0, 0.0, 1.0, 5e-4), 1e-3
+    b = float(minimum_damping(Coupling(1.0, 5e-4, 0.0, 0.0), period, delay=1.0))
+    scene, method = posted_scene(CREDIT), method_named("implicit")
+    prepare(scene, law, 0.02, 1, method, warns=False)
+    start = (0.0, 0.0, 0.0, *UPRIGHT)
+    parameters = RunParameters(
+        grip=scene.grip,
+        period=period,
+        substeps=1,
+        coupling=law,
+        force_limit=10.0,
+        torque_limit=5.0,
+        ramp_ticks=0,
+        device_origin=start,
+        handle_origin=start,
+        device_start=start,
+        device_damping=1.0,
+        device_rotational_damping=b,
+        scene_ticks=20,
+        credit=CREDIT,
+        guarding=GuardParameters(has_hand=True, stated_delay=period),
+    )
+    kernel = BoundKernel(scene.model, scene.data, parameters)
+    sample, post = np.zeros(1, SAMPLE_DTYPE), post_of((0.0, 0.0, 0.0))
+    place, late, net, most = np.array(UPRIGHT), np.zeros((2, 3)), 0.0, 0.0
+    for tick in range(4000):
+        step = 0.02 * period / b * late[0]  # lets the spring go in the end
+        if tick < 500:
+            step = np.array([0.0, 0.0, 2.6 / 500])
+        elif tick < 2500:
+            step = 0.02 * np.array([math.cos(1.3 * tick), -math.sin(1.3 * tick), 0.0])
+        net += float(late[0] @ step - b / period * step @ step)
+        most = max(most, net)
+        turn(place, step)
+        sample["quaternion"] = place
+        assert posted_tick(kernel.state, sample, post, kernel.row, period)
+        late = np.array([late[1], kernel.wrench_on_device[3:]])
+    assert most <= UNPAID
 
 
 @pytest.mark.parametrize("force_scale", [0.5, 1.0, 3.0])
@@ -353,6 +454,20 @@ def test_a_work_that_is_stated_and_taken_back_fills_no_tank() -> None:
 
     _, records = run(lies, device="simulated:hand=none", duration=0.5)
     assert np.all(records["scene_tank"] <= CREDIT)
+
+
+def test_a_program_that_shows_in_every_tick_has_no_larger_tank() -> None:
+    """Without a cap in the tick of a post it held 2 J instead of 1 J after six seconds."""
+    tanks: dict[int, float] = {}
+    for every in (1, 2):
+
+        def drags(bridge: Bridge, tick: int, every: int = every) -> None:
+            if tick % every == 0:
+                shows(bridge, post_of(handle_of(bridge) - (0.004, 0.0, 0.0), has_velocity=1))
+
+        _, records = run(drags, device=PullingHand(), duration=6.0)
+        tanks[every] = float(records["scene_tank"].max())
+    assert tanks[1] == pytest.approx(tanks[2], rel=0.01)
 
 
 def test_normals_of_another_length_are_no_post() -> None:

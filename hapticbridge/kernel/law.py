@@ -12,13 +12,13 @@ poses that resulted. The two agree because the actuators are implicit: MuJoCo so
 of the step.
 
 In four cases the handle's end of the spring moves without the device: it slips. These are changed
-gains, a late sample, an axis without motor, and a hand that is let go (``slip``). With gains that
-change from tick to tick, the identity behind Brown & Colgate's (6) has the term −Σ W_k with W_k =
-V_k(p_k) − V_{k−1}(p_k), p_k = h_k − x_{k−1} and V the energy of the spring. A raised gain would
-hand W_k to the device, so the handle slips toward the tool until V_k(p'_k) = V_{k−1}(p_k); a
-lowered gain loses energy. The gains move in a straight line over ``tuning_ticks`` ticks; the
-damping that a device needs is convex in K and B, so no coupling on the line needs more than the
-larger end.
+gains, a late sample or wrench, an axis without motor, and a hand that is let go (``slip``). With
+gains that change from tick to tick, the identity behind Brown & Colgate's (6) has the term −Σ W_k
+with W_k = V_k(p_k) − V_{k−1}(p_k), p_k = h_k − x_{k−1} and V the energy of the spring. A raised
+gain would hand W_k to the device, so the handle slips toward the tool until V_k(p'_k) =
+V_{k−1}(p_k); a lowered gain loses energy. The gains move in a straight line over ``tuning_ticks``
+ticks; the damping that a device needs is convex in K and B, so no coupling on the line needs more
+than the larger end.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from hapticbridge.kernel.handle import (
 from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.ledger import SLACK_SHARE, moment_dot
 from hapticbridge.kernel.mujoco_c import floats
-from hapticbridge.kernel.parameters import ALL_MOTORS, RunParameters
+from hapticbridge.kernel.parameters import ALL_MOTORS, RunParameters, whole_ticks
 from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
@@ -74,6 +74,9 @@ TUNED = (*_LAW, *_SLACK)
 
 _TUNED_DTYPE = np.dtype([*((name, "<f8") for name in TUNED), ("gains", "<f8", 6)])
 
+SENT = 64
+"""Ticks of which lever, wrench and turn are kept; a device is at most 50 samples late."""
+
 COUPLING_DTYPE = np.dtype(
     [
         *((name, "<f8") for name in TUNED),
@@ -82,8 +85,10 @@ COUPLING_DTYPE = np.dtype(
         ("tuning_ticks", "<i8"),  # ticks left until the goal is reached
         ("lacks_motors", "<i8"),
         ("lacks_motor", "<f8", 6),  # 1 for an axis of the device without motor
-        ("owed", "<f8", 2),  # energy in J that late samples have put into the springs
+        ("owed", "<f8", 2),  # energy in J that late samples and wrenches gave to the springs
         ("tool_then", "<f8", 7),  # tool's pose after the tick of the device's last new sample
+        ("late_ticks", "<i8"),  # d, ticks from a sample to its force
+        ("sent", "<f8", (SENT, 10)),  # lever, wrench on the tool and turn of the last ticks
         ("hold", "<f8", 2),
         ("idle", "<f8", 2),
         ("twist_damping", "<f8"),
@@ -154,6 +159,8 @@ def bind_coupling(coupling: Part, parameters: RunParameters, gains: tuple[float,
     coupling["hold"] = guarding.hold_force, guarding.hold_torque
     coupling["idle"] = guarding.idle_force, guarding.idle_torque
     coupling["twist_damping"] = guarding.twist_damping * parameters.scale / parameters.force_scale
+    late = whole_ticks(guarding.stated_delay, parameters.period)
+    coupling["late_ticks"] = min(late, SENT - 1)
 
 
 def set_tuning_goal(
@@ -554,6 +561,61 @@ def charge_lateness(s: State, interval: float, ticks: int) -> None:
 
 
 @compiled
+def note_sent(s: State) -> None:
+    """Notes lever and wrench on the tool of the present tick, and the mean turn of both ends."""
+    sent, loop = s.coupling.sent[s.loop.tick % SENT], s.loop
+    sent[0] = s.guard.lever
+    for i in range(6):
+        sent[1 + i] = loop.wrench_on_tool[i]
+    for i in range(3):
+        sent[7 + i] = 0.5 * (s.pose.handle_turn[i] + loop.motion[3 + i])
+
+
+def forget_sent(coupling: Part) -> None:
+    """Forgets the wrenches on their way to the device: it holds none, or the springs are empty."""
+    coupling["sent"] = 0.0
+
+
+@compiled
+def charge_lag(s: State, lever: float, ticks: int, moved: Vector, turned: Vector) -> None:
+    """Charges the springs with what a late wrench gives beside the law's own delay.
+
+        Z_k = max_j (r_{k−1} − r_{k−1−j}) f_{k−1−j}·scale A δp_k,    j = 0 … d
+        Z_k = max_j (r_{k−1} Q_j − r_{k−1−j}) τ_{k−1−j}·A δφ_k
+
+    The handle moves by r_{k−1} times the device's motion δp in m and δφ in rad. The device still
+    holds the wrench of j ticks before, with the lever r of that time, and a torque in the direction
+    of that time. d counts the ticks of its delay, and those in which a slow device gave no sample.
+    Q_j is the mean turn of handle and tool since then, with which the torque of a coupling turns.
+    Otherwise a hand gets (T/4b) (Δr F)² a tick for nothing while the force fades, and a hand that
+    wobbles about a twist, with a tool that follows, up to τ Σ_j sin(jθ) ‖δφ‖².
+
+    Args:
+        s: The bound state.
+        lever: r_{k−1}.
+        ticks: Ticks since the last new sample.
+        moved: δp in the device's frame.
+        turned: δφ in the device's frame.
+    """
+    k = s.coupling
+    way = scaled(s.run.scale, scene_from_device(s.run.axes, moved))
+    turn = scene_from_device(s.run.axes, turned)
+    most = most_r = 0.0
+    since, late = (0.0, 0.0, 0.0), k.late_ticks
+    if ticks <= s.guard.stale_ticks:  # after a longer silence the force has faded
+        late = min(late + ticks - 1, SENT - 1)
+    for j in range(1, late + 1):
+        since = add(since, vector_of(k.sent[(s.loop.tick - j) % SENT][7:10]))
+        sent = k.sent[(s.loop.tick - 1 - j) % SENT]
+        most = max(most, (lever - sent[0]) * dot(vector_of(sent[1:4]), way))
+        torque = vector_of(sent[4:7])
+        carried = scaled(lever, rotated(quaternion_exp(since), torque))
+        most_r = max(most_r, dot(subtract(carried, scaled(sent[0], torque)), turn))
+    k.owed[0] += most
+    k.owed[1] += most_r
+
+
+@compiled
 def _paid(spring: Spring, length: float, owed: float) -> tuple[float, float]:
     """Returns the length at which a spring has paid what it owes, and what is left to pay."""
     energy = spring_energy(spring, length)
@@ -578,10 +640,10 @@ def felt(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
 def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     """Slips the handle toward the tool, where the spring holds more than it may.
 
-    Four things make it slip. A late sample is charged (``charge_lateness``). A raised gain must not
-    raise the spring's energy. Along an axis without motor the coupling holds up to ``hold`` and
-    then slips. While the hand is let go it relaxes to ``idle``. Each only shortens the spring, so
-    energy is lost and none is gained.
+    Four things make it slip. A late sample or wrench is charged (``charge_lateness``,
+    ``charge_lag``). A raised gain must not raise the spring's energy. Along an axis without motor
+    the coupling holds up to ``hold`` and then slips. While the hand is let go it relaxes to
+    ``idle``. Each only shortens the spring, so energy is lost and none is gained.
 
     Args:
         s: The bound state, with the handle's new and the tool's old pose.

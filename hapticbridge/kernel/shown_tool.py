@@ -27,7 +27,7 @@ is what the hand has given and the scene has not yet got. It is another tank tha
 nearest to y*, on the way there, with which D does not become negative (passive set-position
 modulation, Lee & Huang 2010), so the hand gets nothing that the scene did not give. D is capped, so
 that an hour of dissipation does not pay for one push. The cap holds from the tick after a result
-on.
+on, and of another program in every tick.
 
 A result may have taken more than the hand has given by now, W > Σ P, because the hand turned back
 meanwhile. D is then negative: a loan to the scene, −D. Until the scene or the hand has paid it, the
@@ -490,7 +490,7 @@ def shown_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
         share, work = _paid_share(s, before, (step, turn), (work, least))
     shown.work = work
     shown.tank += work
-    if shown.age > 0:
+    if shown.age > 0 or shown.is_posted:  # another program may post in every tick
         shown.tank = min(shown.tank, 2.0 * _credit(s) + shown.passing)
     shown.age += 1
     shown.silence += 1

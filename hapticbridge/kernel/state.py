@@ -64,6 +64,7 @@ from hapticbridge.kernel.law import (
     COUPLING_DTYPE,
     Gains,
     bind_coupling,
+    forget_sent,
     implicit_gains,
     set_tuning_goal,
 )
@@ -277,6 +278,7 @@ class BoundKernel:
         """Starts the ramp at the next tick, after a pause in which zero was commanded."""
         s = self._record
         restart_ramp(s["guard"], int(s["loop"]["tick"]), int(s["run"]["ramp_ticks"]))
+        forget_sent(s["coupling"])
         pause(s["loop"])
 
     def tune(self, parameters: RunParameters, gains: tuple[Gains, Gains], ticks: int) -> None:
@@ -319,6 +321,7 @@ class BoundKernel:
         move_handle_home(s["pose"], at_tool=pose is not None)
         restore_model(self._model, self._owned)
         discard_wrench(s["loop"])
+        forget_sent(s["coupling"])
         direct(refresh_energies, s)(s)
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         add_reset_work(s["energy"], after - before)

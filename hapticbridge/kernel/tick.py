@@ -76,9 +76,11 @@ from hapticbridge.kernel.handle import (
 )
 from hapticbridge.kernel.jit import compiled, compiled_for_threads
 from hapticbridge.kernel.law import (
+    charge_lag,
     charge_lateness,
     command_handle_velocity,
     felt,
+    note_sent,
     note_tool,
     retune,
     slack_of_step,
@@ -250,6 +252,7 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
     is_timed = s.run.has_law and s.guard.has_hand and s.loop.tick > s.guard.start_tick
     if is_timed:
         charge_lateness(s, interval, ticks)
+        charge_lag(s, lever, ticks, moved, turned)
     else:
         note_tool(s)
     if s.mj.metered_mocaps > 0 and s.run.scheme != Scheme.SHOWN:
@@ -589,6 +592,7 @@ def _render(s: State, force: Vector, torque: Vector) -> None:
     force, torque = within_energy_limit(s, force, torque)
     store_vector(s.loop.wrench_on_device[0:3], force)
     store_vector(s.loop.wrench_on_device[3:6], torque)
+    note_sent(s)
 
 
 @compiled

@@ -185,6 +185,8 @@ def minimum_damping(
 
     The larger of the two s is taken, because a part of a tick may ask less of a damper than none.
     By the backward rule the bound holds for every constant delay up to the given one.
+    In rotation a coupling's torque turns with handle and tool, and a late one does not. The bound
+    leaves that out; the springs pay for it (``kernel.law.charge_lag``).
 
     It is **sufficient** for every passive hand and every discrete-time passive scene (14), also
     nonlinear and changing ones. For n = 1 and φ = 0 it is **necessary**: at the worst frequency a
