@@ -295,6 +295,9 @@ SECONDS = "seconds"
 FLAG_LEGEND = {str(flag.value): flag.name for flag in TickFlag}
 """Names of the bits of the column ``flags``, by value."""
 
+BIT_FIELDS: dict[str, dict[str, str | None]] = {"flags": FLAG_LEGEND, "buttons": {}}
+"""Fields whose numbers are bits, with the bits' names by value as far as they have one."""
+
 
 class TableColumns:
     """Columns of a table of ticks: ``SECONDS``, then one per number of a record.
