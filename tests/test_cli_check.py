@@ -39,6 +39,18 @@ def test_check_tells_counts_stiffness_and_cost(tmp_path: Path, call: Called) -> 
     assert "(contacts of the scene, by its solref and solimp)" in out
 
 
+@pytest.mark.parametrize("is_fused", [False, True])
+def test_check_names_a_body_whose_inertia_mujoco_refuses(
+    is_fused: bool, tmp_path: Path, call: Called
+) -> None:
+    rod = "<body name='rod'><joint/><inertial pos='0 0 0' mass='1' diaginertia='0 0 0'/></body>"
+    base = f"<body name='base'><geom size='.01'/>{rod}</body>"
+    fuse = f"<compiler fusestatic='{str(is_fused).lower()}'/>"
+    code, out, _ = call("check", scene_file(tmp_path, mjcf(fuse, world=base)))
+    assert code == 1
+    assert "body 'rod' moves, and MuJoCo refuses its inertia" in out
+
+
 def test_check_draws_a_motion_too_short_to_measure_growth(tmp_path: Path, call: Called) -> None:
     picture, motion = tmp_path / "check.png", tmp_path / "short.csv"
     motion.write_text("t,x,y,z\n0,0,0,0\n0.05,0.001,0,0\n")

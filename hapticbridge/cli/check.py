@@ -21,6 +21,7 @@ from hapticbridge.check.case import (
     IntendedUse,
     SceneUnderCheck,
     open_case,
+    refused_body,
 )
 from hapticbridge.check.cost import TICK_SHARE, Cost, Growth, draw_cost, measure_cost
 from hapticbridge.check.findings import find_faults
@@ -355,7 +356,11 @@ class Check:
         budget = checked_budget(1.0 if self.budget is None else self.budget)
         with compiling(self.scene):
             source = read_scene(self.scene, **settings_from(self.settings))
-            plain_model(source)
+            try:
+                plain_model(source)
+            except SceneError as error:
+                if refused_body(error) is None:  # else it gets a stand-in
+                    raise
         if self.write is not None:
             check_lean_target(source, self.write, overwrite=self.overwrite)
         period = None if self.rate is None else period_of(self.rate)

@@ -45,6 +45,17 @@ PROGRAM_CREDIT = "another_programs_credit"
 """Custom number of a scene that another program steps: what it may give to a hand, in J."""
 
 
+def unfused_model(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compiles a copy in which bodies without joints are not fused with their parents.
+
+    Each body of the specification is then one of the model, with its own mass. MuJoCo fuses those
+    of a URDF, and those of a scene with ``fusestatic``.
+    """
+    copy = spec.copy()
+    copy.compiler.fusestatic = False
+    return copy.compile()
+
+
 # Start of a scene, with the handle at the grip
 
 START_KEYFRAME = "home"

@@ -424,5 +424,16 @@ def _found_nowhere(path: Path, error: Exception) -> str:
     """Returns MuJoCo's words; of a file that it does not find, with the folder it looked in."""
     if str(error).startswith("Error: Error opening file"):  # MuJoCo's own
         places = f"'{path.resolve().parent}' and its meshdir or texturedir, if it names one"
+        with suppress(OSError):
+            if "'package:" in str(error):
+                places += (
+                    '; MuJoCo resolves no package://, but <mujoco><compiler strippath="true" '
+                    'meshdir="FOLDER"/></mujoco> in <robot> finds the bare names in FOLDER'
+                )
+            elif b"<include" in path.read_bytes():
+                places += (
+                    '; for the files of a part <compiler meshdir="FOLDER"/> behind its <include> '
+                    "counts, with FOLDER seen from here"
+                )
         return f"{clause(error)}, looked for in {places}"
     return clause(error)
