@@ -522,7 +522,8 @@ def test_bytes_behind_a_whole_file_are_damage_and_no_cut(
     path, content = tmp_path / "run.mcap", whole.read_bytes()
     more = content * copies or bytes(3)
     recording = changed(path, content + more)
-    words = f"{len(more)} bytes follow its end ('truncate -s {len(content)}' takes them away)"
+    mend = f"('truncate -s {len(content)}' takes them away)"
+    words = f"its end is followed by {len(more)} more bytes {mend}"
     assert (recording.is_cut, recording.problems) == (False, (words,))
     assert recording.ticks.tobytes() == read_recording(whole).ticks.tobytes()
     recording = changed(path, path.read_bytes()[: len(content)])

@@ -263,14 +263,14 @@ class Container:
         end = first + _FOOTER_SIZE + len(MAGIC)
         more = len(self._data) - end
         self.problems.append(
-            f"{more} byte{'s' * (more > 1)} follow its end ('truncate -s {end}' takes them away)"
+            f"its end is followed by {more} more byte{'s' * (more > 1)} ('truncate -s {end}' takes "
+            "them away)"
         )
 
     def _read_footer(self, footer: int) -> None:
         self._end, self.is_cut = footer, False
         start, _, crc = _FOOTER.unpack(self._data[footer + _RECORD.size : footer + _FOOTER_SIZE])
-        if start == 0 and crc == 0:
-            return
+        start = start or footer  # without an index the checksum is that of the footer
         if not len(MAGIC) <= start <= footer or (
             crc and self._data.checksum(start, self._end + _FOOTER_SIZE - 4) != crc
         ):
