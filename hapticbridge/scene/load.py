@@ -34,6 +34,7 @@ from hapticbridge.scene.compile import (
 )
 from hapticbridge.scene.grip import add_grip
 from hapticbridge.scene.handle import (
+    LET_GO,
     announce_overlaps,
     attach_handles,
     exclude_nested,
@@ -366,11 +367,13 @@ def compile_scene(
             changes, model = changes + excluded, spec.compile()
         concerns = [each + MAY_BE_ACTIVE for each in unmetered_work(model).values()]
         concerns += about_grip
+        held = list[str]()
         for each in dict.fromkeys(grips):
             check_model(model, each)
         for each in dict.fromkeys(grips):
             replaced, holding = take_over_mocap(spec, model, each, as_is=as_is)
-            changes, concerns = changes + replaced, [*concerns, *holding]
+            changes, held = changes + replaced, [*held, *holding]
+        concerns += [f"{each}; to let it go write {LET_GO}" for each in held]
         model, started, remaining = _start_set(spec, model, source, as_is=as_is)
         changes, concerns = changes + started, [*concerns, *remaining]
         seat_handle(model, grips[0])
@@ -378,7 +381,7 @@ def compile_scene(
         scene = Scene(
             path, grips[0], model, data, source.sources, values, changes, as_is, _spec=spec
         )
-        scene.other_grips = grips[1:]
+        scene.other_grips, scene.held = grips[1:], tuple(held)
         scene.reset()
         for each in dict.fromkeys(grips):
             scene.differences += limit_motors_alone(model, scene.data, each, as_is=as_is)
