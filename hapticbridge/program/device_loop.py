@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticbridge.arguments import Rule, checked_value
 from hapticbridge.errors import DeviceLost, HapticBridgeError, SafetyTrip
 from hapticbridge.kernel.record import PLANES, POST_DTYPE, TICK_DTYPE
 from hapticbridge.program.loop_process import TOKEN_VARIABLE, LoopProcess
@@ -283,7 +284,7 @@ class DeviceLoop:
             seconds: Time in s; whole ticks of it count, at least one.
 
         Raises:
-            HapticBridgeError: The loop runs in real time.
+            HapticBridgeError: The loop runs in real time, or the time is no number >= 0.
             DeviceLost: It does not answer.
         """
         state = self._newest()
@@ -291,6 +292,8 @@ class DeviceLoop:
             raise HapticBridgeError(
                 "real time goes on by itself; advance() is for is_simulated=True"
             )
+        rule = Rule(unit="s", least=0.0)
+        checked_value("seconds", seconds, (float,), rule, HapticBridgeError)
         with self._lock:
             self._call["ticks"] = max(round(seconds / float(state["period"])), 1)
             self._send(Call.ADVANCE)
