@@ -88,6 +88,24 @@ def test_links_that_mujoco_fuses_are_held_at_their_own_centre_or_origin(tmp_path
         assert hb.load_scene(path, grip=grip).grip_pose()[2] == pytest.approx(height), grip
     assert "'base' sits on the world, which cannot move" in refusal(path, "base")
     assert "'tool' (body, 0.1 kg" in refusal(path, "nothing")
+    mount = '<joint name="a" type="floating"><parent link="base"/><child link="beam"/></joint>'
+    text = LINKS.replace(next(line for line in LINKS.splitlines() if '"a"' in line), mount)
+    path = scene_file(tmp_path, text, "flying.urdf")
+    assert hb.load_scene(path, grip="tcp").grip_pose()[2] == pytest.approx(0.2)
+
+
+def test_unnamed_bodies_have_no_number_where_others_are_fused(tmp_path: Path) -> None:
+    fixed = "<body pos='1 0 0'><geom size='.1'/></body>"
+    free = "<body pos='2 0 0'><freejoint/><geom size='.1'/></body>"
+    for is_fused in (False, True):
+        compiler = f"<compiler fusestatic='{str(is_fused).lower()}'/>"
+        text = mjcf(compiler, body=fixed + free)
+        if is_fused:
+            assert "'2'" not in refusal_of(tmp_path, text, "2").partition("hold")[2]
+        else:
+            pose = hb.load_scene(scene_file(tmp_path, text), grip="2").grip_pose()
+            assert pose[0] == pytest.approx(2.0)
+            assert "'2' (body" in refusal_of(tmp_path, text, "3")
 
 
 def test_a_body_without_mass_is_held_at_its_origin(tmp_path: Path) -> None:

@@ -49,10 +49,17 @@ def unfused_model(spec: mujoco.MjSpec) -> mujoco.MjModel:
     """Compiles a copy in which bodies without joints are not fused with their parents.
 
     Each body of the specification is then one of the model, with its own mass. MuJoCo fuses those
-    of a URDF, and those of a scene with ``fusestatic``.
+    of a URDF, and those of a scene with ``fusestatic``. A free joint below one of them becomes a
+    ball joint, as MuJoCo takes no free joint there.
     """
     copy = spec.copy()
-    copy.compiler.fusestatic = False
+    if copy.compiler.fusestatic:
+        copy.compiler.fusestatic = False
+        for joint in copy.joints:
+            if joint.type == mujoco.mjtJoint.mjJNT_FREE and joint.parent.parent.id:
+                joint.type = mujoco.mjtJoint.mjJNT_BALL
+        for key in list(copy.keys):  # they have the size of the free joints
+            copy.delete(key)
     return copy.compile()
 
 

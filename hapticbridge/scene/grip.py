@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -184,10 +184,11 @@ def add_grip(spec: mujoco.MjSpec, grip: str) -> list[str]:
             "body at its origin"
         ]
     model = unfused_model(spec)
-    bodies |= {str(i): body for i, body in enumerate(spec.bodies) if not body.name}
+    if not spec.compiler.fusestatic:  # which changes their numbers
+        bodies |= {str(i): body for i, body in enumerate(spec.bodies) if not body.name}
     name, is_point, text = (grip, "", "") if grip in bodies else grip.rpartition("@")
     if name not in bodies:
-        raise SceneError(_offer(model, grip))
+        raise SceneError(_offer(model, grip, bodies))
     body = bodies[name]
     body_id = model.body(name).id if body.name else int(name)
     point = _point_of(grip, text) if is_point else _centre(model, body_id).tolist()
@@ -219,8 +220,12 @@ def _point_of(grip: str, text: str) -> list[float]:
     return point
 
 
-def _offer(model: mujoco.MjModel, grip: str) -> str:
-    offered = grips(model)
+def _offer(model: mujoco.MjModel, grip: str, bodies: Container[str]) -> str:
+    offered = [
+        each
+        for each in grips(model)
+        if each.kind == "site" or each.name in bodies or each.name.rpartition("@")[0] in bodies
+    ]
     head = f"the scene has no site or body '{grip}' to hold"
     if not offered:
         return f"{head}, and nothing in it can move; give a body a joint"
