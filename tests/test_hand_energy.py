@@ -382,7 +382,7 @@ def test_a_run_that_tripped_and_its_audit_name_the_tick_by_which_they_differ(
         with pytest.raises(SafetyTrip):
             bridge.run(duration=1.0)
         summary = bridge.summary()
-    assert f"{summary.hand_energy.sentence}, with the tick that tripped" in str(summary)
+    assert f"with the tick that tripped, {summary.hand_energy.sentence}" in str(summary)
     report = audit(path)
     assert INSTANT < report.hand_energy.net < summary.hand_energy.net
     words = f"net to the hand, before the tick that tripped, {report.hand_energy.sentence}"
