@@ -87,11 +87,12 @@ def test_links_that_mujoco_fuses_are_held_at_their_own_centre_or_origin(tmp_path
     for grip, height in {"beam": 0.1, "tcp": 0.2, "tcp@0,0,.1": 0.3, "tool": 0.23}.items():
         assert hb.load_scene(path, grip=grip).grip_pose()[2] == pytest.approx(height), grip
     assert "'base' sits on the world, which cannot move" in refusal(path, "base")
-    assert "'tool' (body, 0.1 kg" in refusal(path, "nothing")
+    assert "'beam' (body, 0.18 kg, 1 of 6 free)" in refusal(path, "nothing")
     mount = '<joint name="a" type="floating"><parent link="base"/><child link="beam"/></joint>'
     text = LINKS.replace(next(line for line in LINKS.splitlines() if '"a"' in line), mount)
     path = scene_file(tmp_path, text, "flying.urdf")
     assert hb.load_scene(path, grip="tcp").grip_pose()[2] == pytest.approx(0.2)
+    assert "'beam' (body, 0.18 kg, 6 of 6 free)" in refusal(path, "nothing")
 
 
 def test_unnamed_bodies_have_no_number_where_others_are_fused(tmp_path: Path) -> None:

@@ -183,13 +183,12 @@ def add_grip(spec: mujoco.MjSpec, grip: str) -> list[str]:
             f"'{grip}' is a site and a body, and the hand holds the site; '{grip}@0,0,0' is the "
             "body at its origin"
         ]
-    model = unfused_model(spec)
     if not spec.compiler.fusestatic:  # which changes their numbers
         bodies |= {str(i): body for i, body in enumerate(spec.bodies) if not body.name}
     name, is_point, text = (grip, "", "") if grip in bodies else grip.rpartition("@")
     if name not in bodies:
-        raise SceneError(_offer(model, grip, bodies))
-    body = bodies[name]
+        raise SceneError(_offer(spec.copy().compile(), grip, bodies))
+    body, model = bodies[name], unfused_model(spec)
     body_id = model.body(name).id if body.name else int(name)
     point = _point_of(grip, text) if is_point else _centre(model, body_id).tolist()
     site = body.add_site(name=grip)
