@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -296,7 +297,7 @@ def _limit_memory(spec: mujoco.MjSpec) -> tuple[SceneChange, ...]:
         return ()
     spec.memory, spec.nstack, spec.njmax, spec.nconmax = MAX_MEMORY, -1, -1, -1
     asked = format_si(before, "B") if before > MAX_MEMORY else f"for {rows} rows"
-    return (SceneChange(f"memory: {asked} → {format_si(MAX_MEMORY, 'B')}", "memory"),)
+    return (SceneChange(f"memory: {asked} → {_memory(MAX_MEMORY)}", "memory"),)
 
 
 def _compiled(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, tuple[SceneChange, ...]]:
@@ -306,8 +307,13 @@ def _compiled(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, tuple[SceneChange, .
         return model, ()
     before, spec.memory, spec.nstack, spec.njmax = model.narena, -1, -1, -1
     model = spec.compile()
-    sizes = (format_si(size, "B") for size in (before, model.narena))
-    return model, (SceneChange(f"memory: {' → '.join(sizes)}", "memory"),)
+    words = f"memory: {format_si(before, 'B')} → {_memory(model.narena)}"
+    return model, (SceneChange(words, "memory"),)
+
+
+def _memory(size: int) -> str:
+    """Returns a size in bytes, and as <size> takes it, in whole 2^20 bytes."""
+    return f'{format_si(size, "B")} (memory="{math.ceil(size / (1 << 20))}M")'
 
 
 MIN_MEMORY = 13 << 20
