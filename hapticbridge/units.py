@@ -30,6 +30,11 @@ def format_si(value: float, unit: str) -> str:
     return f"{value:.2g} {unit}"
 
 
+def format_number(value: float, digits: int = 4) -> str:
+    """Formats a number with so many digits; a large one has no exponent: ``24000``, ``1e-05``."""
+    return f"{float(f'{value:.{digits}g}'):.15g}"
+
+
 def format_forces(hand: float | None, tool: float, unit: str = "N") -> str:
     """Names whose a force or torque is: ``1.7 N on the hand, 5.67 N on the tool``.
 

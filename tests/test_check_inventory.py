@@ -213,6 +213,21 @@ def test_geoms_without_a_name_in_an_included_file_are_told_apart(tmp_path: Path)
     assert places == [("parts.xml", 2), ("parts.xml", 4)]
 
 
+@pytest.mark.parametrize("is_fused", [False, True])
+def test_an_unnamed_element_behind_a_fusion_has_no_line_of_another(
+    is_fused: bool, tmp_path: Path
+) -> None:
+    """MuJoCo moves the bodies of a fused one behind the others, so that their numbers change."""
+    block = "<joint/><geom size='.1'/></body>"
+    base = f"<body>\n<body pos='7 0 0'>\n{block}</body>\n<body pos='9 0 0'>\n{block}"
+    fuse = f"<compiler fusestatic='{str(is_fused).lower()}'/>"
+    case = case_of(written(tmp_path, mjcf(fuse, GOOD_OPTION, world=base)))
+    at = int(np.flatnonzero(case.model.body_pos[:, 0] == 9.0)[0])
+    text = case.source.path.read_text().splitlines()
+    line = case.places.body(at).line
+    assert (line == 0) if is_fused else ("<body pos='9 0 0'>" in text[line - 1])
+
+
 def test_places_of_a_repeated_element_are_the_line_that_repeats_it() -> None:
     source = read_scene("round_peg")
     places = Places(source, shipped_case("round_peg").model)

@@ -297,6 +297,20 @@ def test_mass_stays_where_geoms_overrule_what_is_written(tmp_path: Path) -> None
     np.testing.assert_allclose(after.body_ipos, before.body_ipos)
 
 
+def test_mass_stays_where_bodies_are_fused(tmp_path: Path) -> None:
+    weight = (
+        '<body><geom size="0.02" pos="0.05 0 0" mass="0.5" contype="0" conaffinity="0"/></body>'
+    )
+    fused = '<mujoco><compiler fusestatic="true"/>'
+    draft = draft_of(tmp_path, block_of_mesh(BOX, weight).replace("<mujoco>", fused))
+    changed = draft.copy()
+    assert all_of(draft, PRESS)["nothing only seen"].edit(changed)
+    before, after = draft.compiled().model, changed.compiled().model
+    assert (before.nbody, after.ngeom) == (after.nbody, before.ngeom - 1)
+    np.testing.assert_allclose(after.body_mass, before.body_mass)
+    np.testing.assert_allclose(after.body_inertia, before.body_inertia, rtol=1e-6)
+
+
 def test_what_a_sensor_refers_to_is_not_taken_away(tmp_path: Path) -> None:
     weight = '<geom name="weight" size="0.02" mass="0.5" contype="0" conaffinity="0"/>'
     sensor = '<sensor><framepos objtype="geom" objname="weight"/></sensor>'

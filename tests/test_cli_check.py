@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import mujoco
 import pytest
 from check_scenes import PLANTS, bench, line_of
 from cli_cases import Called, facts_of
@@ -37,6 +38,38 @@ def test_check_tells_counts_stiffness_and_cost(tmp_path: Path, call: Called) -> 
     _, out, _ = call("check", "virtual_wall", "--contact", "scene")
     assert "kN/m at the tool" in out and "21,200" not in out
     assert "(contacts of the scene, by its solref and solimp)" in out
+
+
+@pytest.mark.parametrize("is_fused", [False, True])
+def test_check_names_a_body_whose_inertia_mujoco_refuses(
+    is_fused: bool, tmp_path: Path, call: Called
+) -> None:
+    rod = "<body name='rod'><joint/><inertial pos='0 0 0' mass='1' diaginertia='0 0 0'/></body>"
+    base = f"<body name='base'><geom size='.01'/>{rod}</body>"
+    fuse = f"<compiler fusestatic='{str(is_fused).lower()}'/>"
+    code, out, _ = call("check", scene_file(tmp_path, mjcf(fuse, world=base)))
+    assert code == 1
+    assert "body 'rod' moves, and MuJoCo refuses its inertia" in out
+
+
+LINK = """<robot name="r">{}<link name="base"/><link name="tool"><inertial><mass value="0.3"/>
+<inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial></link>
+<joint name="j" type="prismatic"><parent link="base"/><child link="tool"/>
+<limit lower="-1" upper="1" effort="0" velocity="1"/></joint></robot>"""
+
+
+def test_check_says_where_a_urdf_takes_what_it_names(tmp_path: Path, call: Called) -> None:
+    """The finding is gone once the file has what the note says."""
+    path = scene_file(tmp_path, LINK.format(""), "arm.urdf")
+    _, out, _ = call("check", path, "--grip", "tool")
+    assert 'timestep="0.001"' in out
+    assert "<option> and <compiler> go into <mujoco> in <robot>" in out
+    own = '<mujoco><option timestep="0.001"/></mujoco>'
+    path = scene_file(tmp_path, LINK.format(own), "arm.urdf")
+    assert 'timestep="0.001"' not in call("check", path, "--grip", "tool")[1]
+    text = mujoco.MjSpec.from_file(str(path)).to_xml()
+    _, out, _ = call("check", scene_file(tmp_path, text), "--grip", "tool")
+    assert "URDF" not in out
 
 
 def test_check_draws_a_motion_too_short_to_measure_growth(tmp_path: Path, call: Called) -> None:

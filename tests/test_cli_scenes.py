@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from cli_cases import Called, facts_of, one_sentence
+from outside_scenes import scene_file, stl_bytes
 
 
 def test_the_next_command_of_a_scene_runs(call: Called) -> None:
@@ -34,6 +35,29 @@ def test_a_scene_of_one_s_own_is_shown_whatever_its_grip_is_called(
     code, _, err = call("scenes", path)
     assert code == 2
     assert f"'m.stl', looked for in '{tmp_path}' and its meshdir or texturedir" in err
+    assert err.rstrip().endswith("if it names one")
+
+
+@pytest.mark.parametrize("is_mended", [False, True])
+def test_a_mesh_that_is_not_found_is_told_with_what_finds_it(
+    is_mended: bool, call: Called, tmp_path: Path
+) -> None:
+    """The mesh is found where the scene has what the message says."""
+    scene_file(tmp_path / "parts", stl_bytes(), "m.stl")
+    mesh = "<asset><mesh name='m' file='m.stl'/></asset>"
+    part = "<mujoco><compiler meshdir='m'/><worldbody><geom type='mesh' mesh='m'/></worldbody>"
+    (tmp_path / "parts" / "part.xml").write_text(f"{part}{mesh}</mujoco>")
+    scene, robot = tmp_path / "own" / "scene.xml", tmp_path / "own" / "robot.urdf"
+    scene.parent.mkdir()
+    later = "<compiler meshdir='../parts'/>" if is_mended else ""
+    scene.write_text(f"<mujoco><include file='../parts/part.xml'/>{later}</mujoco>")
+    found = '<mujoco><compiler strippath="true" meshdir="../parts"/></mujoco>' if is_mended else ""
+    mesh = '<geometry><mesh filename="package://arm/parts/m.stl"/></geometry>'
+    link = f'<link name="base"><collision>{mesh}</collision></link>'
+    robot.write_text(f'<robot name="arm">{found}{link}</robot>')
+    for path, words in ((scene, 'meshdir="FOLDER"/> behind its <include>'), (robot, "strippath")):
+        code, _, err = call("scenes", path)
+        assert (code, words in err) == ((0, False) if is_mended else (2, True))
 
 
 def test_a_new_scene_has_no_fault_and_runs(

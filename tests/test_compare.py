@@ -95,6 +95,26 @@ def test_clock_and_recorder_make_no_difference(tap: Path, tmp_path: Path) -> Non
     assert not compare(tap, changed(tap, tmp_path, stale)).is_same
 
 
+def test_bits_are_compared_by_name_and_counts_as_counts(
+    tap: Path, tmp_path: Path, call: Called
+) -> None:
+    """As numbers, one high bit would outweigh several low ones."""
+
+    def change(rows: NDArray[np.void]) -> None:
+        rows["flags"][5] ^= int(TickFlag.REANCHORED)
+        rows["flags"][6] ^= int(TickFlag.CLUTCH | TickFlag.FORCE_LIMITED)
+        rows["buttons"][7] ^= 1 << 3
+        rows["scene_step"][8] += 123456
+
+    other = changed(tap, tmp_path, change)
+    sizes = {each.column: each.size for each in compare(tap, other).largest}
+    assert sizes == {"flags": 2.0, "buttons": 1.0, "scene_step": 123456.0}
+    _, out, _ = call("compare", tap, other)
+    assert "in flags, by REANCHORED: " in out
+    assert "FORCE_LIMITED, CLUTCH at tick 6" in out
+    assert "bit 3 at tick 7" in out and "123456 at tick 8" in out
+
+
 def test_ticks_out_of_order_are_refused(tap: Path, tmp_path: Path) -> None:
     """Matched by number alone, a run written backwards would be the same run."""
 

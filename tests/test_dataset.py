@@ -126,6 +126,7 @@ def test_robomimic_has_its_groups(runs: list[Path], tmp_path: Path) -> None:
         demos = [file["data"][name.decode()] for name in file["mask/train"]]
         assert file["data"].attrs["total"] == sum(demo.attrs["num_samples"] for demo in demos)
         assert json.loads(file["data"].attrs["env_args"])["env_name"] == "ratchet"
+        assert [demo.attrs["recording"] for demo in demos] == [run.name for run in runs]
         for demo in demos:
             count = demo.attrs["num_samples"]
             for name in ("actions", "states", "rewards", "dones", "obs/qpos", "next_obs/qpos"):
@@ -146,7 +147,7 @@ def test_what_cannot_be_learned_from_is_refused_and_leaves_nothing(
     cases: list[tuple[list[Path], str, Shot, str]] = [
         ([], "lerobot", Shot(), "a recording at least"),
         ([cut], "lerobot", Shot(), "its end is missing"),
-        ([runs[0], other], "lerobot", Shot(), "are of one scene"),
+        ([runs[0], other], "lerobot", Shot(), f"than '{runs[0].name}'; the episodes of a data"),
         ([other], "robomimic", Shot(fps=1), "shorter than two frames"),
         (runs, "lerobot", Shot(camera="nowhere"), "no camera 'nowhere'"),
         (runs, "csv", Shot(), "the formats are 'lerobot', 'robomimic'"),

@@ -171,11 +171,13 @@ def test_each_mistake_of_a_program_gets_a_sentence() -> None:
         for wrong in (Surface((0, 0), (0, 0, 1)), Surface((0, 0, 0), (0, 0, 1), -0.1)):
             with pytest.raises(HapticBridgeError, match="a point of 3 numbers, and a gap"):
                 device.show(START, None, [wrong])
-        for strange, words in ((np.nan, "finite"), (-1.0, "above 0"), ("x", "numbers")):
+        for strange, words in ((np.nan, "finite"), (-1.0, "must be 0 to"), ("x", "numbers")):
             with pytest.raises(HapticBridgeError, match=words):
                 device.advance(strange)
         with pytest.raises(HapticBridgeError, match="17 surfaces are shown; 16 are the most"):
             device.show(START, None, [Surface((0, 0, 0), (0, 0, 1))] * 17)
+        device.show(START)
+        device.advance(0.0)
 
 
 @pytest.mark.parametrize(

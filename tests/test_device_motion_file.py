@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import zstandard
 from audit_cases import recorded
+from mcap.writer import IndexType
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -16,7 +19,7 @@ import hapticbridge as hb
 from hapticbridge.check.case import motion_for
 from hapticbridge.device import open_device, read_motion
 from hapticbridge.device.motion_file import read_bag
-from hapticbridge.errors import DeviceError
+from hapticbridge.errors import DeviceError, RecordingError
 from hapticbridge.scene import load_scene
 from hapticbridge.tools.export import export
 
@@ -114,6 +117,59 @@ def test_a_bag_that_is_no_motion_is_refused_with_what_it_holds(tmp_path: Path) -
         (file,) = bag(tmp_path / f"torn{length}", torn).glob("*.mcap")
         with pytest.raises(DeviceError, match="message 0 of /hand cannot be read"):
             open_device(f"trajectory:{file}")
+
+
+@pytest.mark.parametrize("has_chunks", [True, False])
+@pytest.mark.parametrize("has_statistics", [True, False])
+def test_a_bag_without_an_index_or_topics_in_it_is_read(
+    has_statistics: bool, has_chunks: bool, tmp_path: Path
+) -> None:
+    """Its writer may leave out whatever only speeds up reading."""
+    path = tmp_path / "hand.mcap"
+    with path.open("wb") as file:
+        writer: Any = McapWriter(
+            file,
+            use_chunking=has_chunks,
+            use_statistics=has_statistics,
+            index_types=IndexType.NONE,
+            repeat_channels=False,
+            repeat_schemas=False,
+            use_summary_offsets=False,
+        )
+        writer.start("ros2", "a test")
+        schema = writer.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", b"")
+        channel = writer.register_channel("/hand", "cdr", schema)
+        for time, data in ramp():
+            writer.add_message(channel, time, data, time)
+        writer.finish()
+    device = open_device(f"trajectory:{path}")
+    assert device.info.duration == pytest.approx(0.04)
+    with pytest.raises(RecordingError, match=r"it has no topic /tick$"):  # and no damage
+        hb.read_recording(path)
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(RecordingError, match="no topic /tick; the file is cut: its end is missing"):
+        open_device(f"trajectory:{path}")
+    with pytest.raises(DeviceError, match="its end is missing or followed by more"):
+        open_device(f"trajectory:{path}:/hand")
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("bag_0.db3", "in SQLite"),
+        ("hand.bag", "'rosbags-convert --dst-storage mcap'"),
+        ("bag_0.mcap.zstd", "what 'zstd -d' makes of it is read"),
+        ("hand.csv.gz", "what 'gunzip' makes of it is read"),
+    ],
+)
+def test_a_bag_of_another_kind_is_told_with_what_reads_it(
+    name: str, words: str, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(b"\x28\xb5\x2f\xfd")
+    for place in (path, path.parent):
+        with pytest.raises(DeviceError, match=words):
+            open_device(f"trajectory:{place}")
 
 
 def test_a_bag_that_compresses_each_message_is_told(tmp_path: Path) -> None:

@@ -97,6 +97,8 @@ def test_a_scene_with_less_memory_than_mujocos_default_gets_the_default(tmp_path
     assert audit(small).words == "passive (strict)"
     (change,) = (each for each in load_scene(plate(tmp_path, 24)).changes if "memory" in each)
     assert change.startswith("memory: 24.6 kB → 1")
+    written = int(change.partition('(memory="')[2].removesuffix('M")'))
+    assert not any("memory" in each for each in load_scene(plate(tmp_path, written << 10)).changes)
 
 
 def test_more_memory_than_the_default_is_kept(tmp_path: Path) -> None:
@@ -116,7 +118,9 @@ def test_memory_of_gigabytes_is_reduced_and_the_run_can_be_audited(
     scene = load_scene(path)
     assert scene.model.narena == 128 << 20
     (change,) = (each for each in scene.changes if "memory" in each)
-    assert change.endswith("→ 134 MB")
+    assert change.endswith('→ 134 MB (memory="128M")')
+    path.write_text(path.read_text().replace(size, change.partition("(")[2].rstrip(")")))
+    assert not any("memory" in each for each in load_scene(path).changes)
     assert audit(recording).words == "passive (strict)"
 
 

@@ -18,6 +18,7 @@ from hapticbridge.kernel.ledger import ENERGY_TOLERANCE
 from hapticbridge.run.fidelity import (
     NO_HAND,
     Cause,
+    Deviation,
     Fidelity,
     fidelity,
     own_substeps,
@@ -314,3 +315,13 @@ def test_the_comparison_starts_where_the_bridge_starts_and_without_the_mocap_bod
     found = fidelity(source, scene, RunPoint(NO_HAND, PERIOD))
     assert found is not None
     assert found.deviations == ()
+
+
+@pytest.mark.parametrize(
+    ("count", "ends"), [(1, "1 ms)"), (2, "1 more body deviates"), (3, "2 more bodies deviate")]
+)
+def test_the_other_bodies_are_counted_in_words(count: int, ends: str) -> None:
+    apart = tuple(Deviation(f"b{k}", 0.1, 0.0, 0.2, k) for k in range(count))
+    found = Fidelity(apart, ("x", *"yz"[: count - 1]), 3, 1e-3, 1.0, 0.0)
+    assert str(found).partition(";")[0].endswith(ends)
+    assert (f"and of {count - 1} more bod" in found.doubt) is (count > 1)

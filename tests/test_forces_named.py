@@ -18,7 +18,7 @@ from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.page import head_facts
 from hapticbridge.run.options import Workspace
 from hapticbridge.run.summary import Summary
-from hapticbridge.units import format_forces, format_si, format_wrenches
+from hapticbridge.units import format_forces, format_number, format_si, format_wrenches
 from hapticbridge.view.replay import Replay
 
 Called = Callable[..., tuple[int, str, str]]
@@ -126,3 +126,16 @@ def test_force_and_torque_share_an_owner() -> None:
 )
 def test_a_number_has_three_digits_and_the_prefix_that_fits(value: float, text: str) -> None:
     assert format_si(value, "N") == text
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [(20000.0, 4, "20000"), (2412.6, 4, "2413"), (1234.0, 2, "1200"), (1.7, 4, "1.7"), (0, 4, "0")],
+)
+def test_a_large_number_has_no_exponent(value: float, digits: int, text: str) -> None:
+    assert format_number(value, digits) == text
+
+
+def test_a_stiff_coupling_is_printed_as_it_is_typed(call: Called) -> None:
+    _, out, err = call("run", "point_mass", "--fast", "--duration", "0.01", "--stiffness", "20000")
+    assert "K = 20000 N/m, B = " in out and "e+04" not in out + err

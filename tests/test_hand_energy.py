@@ -369,6 +369,26 @@ def test_a_trip_by_inputs_names_them_and_not_the_stiffness(tmp_path: Path) -> No
     assert "--stiffness" not in note
 
 
+def test_a_run_that_tripped_and_its_audit_name_the_tick_by_which_they_differ(
+    tmp_path: Path,
+) -> None:
+    """The refused tick has no record, so an audit cannot know what its sample adds."""
+    path, scene = tmp_path / "run.mcap", tmp_path / "scene.xml"
+    scene.write_text(FLOATING)
+    with fast(scene, recording=path, limits=DEVICE_LIMITS) as bridge:
+        bridge.set_input(body_wrench={"tool": (0.5, 0, 0, 0, 0, 0)})
+        assert "with the tick that tripped" not in str(bridge.run(duration=0.05))
+        bridge.set_input(body_wrench={"tool": (5, 0, 0, 0, 0, 0)})
+        with pytest.raises(SafetyTrip):
+            bridge.run(duration=1.0)
+        summary = bridge.summary()
+    assert f"with the tick that tripped, {summary.hand_energy.sentence}" in str(summary)
+    report = audit(path)
+    assert INSTANT < report.hand_energy.net < summary.hand_energy.net
+    words = f"net to the hand, before the tick that tripped, {report.hand_energy.sentence}"
+    assert words in report.reason
+
+
 def test_a_trip_by_motors_that_took_more_than_they_gave_names_them(tmp_path: Path) -> None:
     """The hoist took more than the other motor gave, so the work of all motors was negative."""
 

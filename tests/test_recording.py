@@ -514,6 +514,22 @@ def test_zeros_behind_the_last_record_are_a_cut(whole: Path, tmp_path: Path) -> 
     assert "nothing can be read from byte" in problem
 
 
+@pytest.mark.parametrize("copies", [0, 1])
+def test_bytes_behind_a_whole_file_are_damage_and_no_cut(
+    copies: int, whole: Path, tmp_path: Path
+) -> None:
+    """The file itself may stand behind it, as after an appending copy: its end is then an end."""
+    path, content = tmp_path / "run.mcap", whole.read_bytes()
+    more = content * copies or bytes(3)
+    recording = changed(path, content + more)
+    mend = f"('truncate -s {len(content)}' takes them away)"
+    words = f"its end is followed by {len(more)} more bytes {mend}"
+    assert (recording.is_cut, recording.problems) == (False, (words,))
+    assert recording.ticks.tobytes() == read_recording(whole).ticks.tobytes()
+    recording = changed(path, path.read_bytes()[: len(content)])
+    assert (recording.is_cut, recording.problems) == (False, ())
+
+
 @given(data=st.data())
 @settings(max_examples=150)
 def test_no_damage_gives_more_than_a_recording_or_error(whole: Path, data: st.DataObject) -> None:

@@ -69,6 +69,53 @@ def test_grip_is_a_site_then_a_body_at_its_centre_of_mass_then_a_point(tmp_path:
         assert f"no site or body '{unknown}'" in refusal_of(tmp_path, arm(), unknown)
 
 
+LINKS = """<robot name="arm"><link name="base"/>
+<link name="beam"><collision><origin xyz="0 0 0.1"/><geometry><box size="0.02 0.02 0.2"/></geometry>
+</collision></link>
+<link name="tcp"/>
+<link name="tool"><inertial><origin xyz="0 0 0.02"/><mass value="0.1"/>
+<inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial></link>
+<joint name="a" type="continuous"><parent link="base"/><child link="beam"/></joint>
+<joint name="b" type="fixed"><origin xyz="0 0 0.2"/><parent link="beam"/><child link="tcp"/></joint>
+<joint name="c" type="fixed"><origin xyz="0 0 .01"/><parent link="tcp"/><child link="tool"/></joint>
+</robot>"""
+
+
+def test_links_that_mujoco_fuses_are_held_at_their_own_centre_or_origin(tmp_path: Path) -> None:
+    path = scene_file(tmp_path, LINKS, "arm.urdf")
+    assert mujoco.MjModel.from_xml_path(str(path)).nbody == 2
+    for grip, height in {"beam": 0.1, "tcp": 0.2, "tcp@0,0,.1": 0.3, "tool": 0.23}.items():
+        assert hb.load_scene(path, grip=grip).grip_pose()[2] == pytest.approx(height), grip
+    assert "'base' sits on the world, which cannot move" in refusal(path, "base")
+    assert "'beam' (body, 0.18 kg, 1 of 6 free)" in refusal(path, "nothing")
+    mount = '<joint name="a" type="floating"><parent link="base"/><child link="beam"/></joint>'
+    text = LINKS.replace(next(line for line in LINKS.splitlines() if '"a"' in line), mount)
+    path = scene_file(tmp_path, text, "flying.urdf")
+    assert hb.load_scene(path, grip="tcp").grip_pose()[2] == pytest.approx(0.2)
+    assert "'beam' (body, 0.18 kg, 6 of 6 free)" in refusal(path, "nothing")
+
+
+def test_unnamed_bodies_have_no_number_where_others_are_fused(tmp_path: Path) -> None:
+    fixed = "<body pos='1 0 0'><geom size='.1'/></body>"
+    free = "<body pos='2 0 0'><freejoint/><geom size='.1'/></body>"
+    for is_fused in (False, True):
+        compiler = f"<compiler fusestatic='{str(is_fused).lower()}'/>"
+        text = mjcf(compiler, body=fixed + free)
+        if is_fused:
+            assert "'2'" not in refusal_of(tmp_path, text, "2").partition("hold")[2]
+        else:
+            pose = hb.load_scene(scene_file(tmp_path, text), grip="2").grip_pose()
+            assert pose[0] == pytest.approx(2.0)
+            assert "'2' (body" in refusal_of(tmp_path, text, "3")
+
+
+def test_a_body_without_mass_is_held_at_its_origin(tmp_path: Path) -> None:
+    """MuJoCo's ``body_ipos`` would hold it twice as far from the hand."""
+    path = scene_file(tmp_path, arm('<body name="tip" pos=".08 0 0"/>'))
+    pose = hb.load_scene(path, grip="tip").grip_pose()
+    assert pose[:3] == pytest.approx((0.38, 0.0, 0.6))
+
+
 def test_run_that_holds_a_point_of_a_body_is_simulated_again(tmp_path: Path, call: Called) -> None:
     text = mjcf("<option gravity='0 0 0' noslip_iterations='2'/>", body=ARM.format(site=""))
     path, file = scene_file(tmp_path, text), tmp_path / "run.mcap"

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
-from outside_scenes import scene_file
+from check_scenes import case_of
+from outside_scenes import mjcf, scene_file
 
 import hapticbridge as hb
+from hapticbridge.check.findings import find_faults
 from hapticbridge.scene import load_scene
 from hapticbridge.scene.scene import Scene
 from hapticbridge.scene.start import row_name
@@ -223,6 +226,29 @@ def test_mocap_body_beside_which_the_grip_moves_is_left_and_named(tmp_path: Path
     assert REPLACED not in scene.changes
     # of two mocap bodies, the one that holds the other body is never named
     assert not any("far" in change for change in load_scene(path, grip="palm").changes)
+
+
+@pytest.mark.parametrize(
+    ("ties", "is_held"),
+    [
+        ("<weld body1='tool'/>", True),
+        ("<weld body1='tool' active='false'/>", False),
+        ("<weld body1='tool' body2='post'/>", True),
+        ("<connect body1='tool' anchor='.1 0 0'/>", False),
+    ],
+)
+def test_a_grip_that_a_weld_to_the_world_holds_fast_is_told(
+    ties: str, is_held: bool, tmp_path: Path
+) -> None:
+    post = "<body name='post' pos='1 0 0'><geom size='.01'/></body>"
+    path = scene_file(tmp_path, mjcf(f"<equality>{ties}</equality>", world=post))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load_scene(path)
+    words = "the grip is held fast by a weld or connect to the world"
+    assert any(words in str(each.message) for each in caught) == is_held
+    found = [each.sentence for each in find_faults(case_of(path)) if each.kind == "held grip"]
+    assert found == [words] * is_held
 
 
 # Overlaps and loads, in words that are true

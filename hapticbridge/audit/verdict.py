@@ -486,6 +486,7 @@ def _hand_words(report: AuditReport) -> str:
     parts = []
     for grip, energy in zip(report.hands or ("",), report.hand_energies, strict=True):
         at = f" at {grip!r}" if grip else ""
+        at += ", before the tick that tripped," if report.trip else ""
         if energy.net > INSTANT:
             parts.append(f"net to the hand{at} {energy.sentence}")
         elif energy.release and not report.credit:

@@ -91,7 +91,9 @@ simulated device has no walls."""
 
 
 _DEFAULT_STEP = 0.01  # s; the motion's fastest part has 0.41 Hz
-_REFUSED = re.compile(r"(mass and inertia of|inertia must satisfy).*?, id (\d+)")
+_REFUSED = re.compile(
+    r"(?:mass and inertia of|inertia must satisfy).*?(?:element '(?P<name>[^']*)', )?id (?P<id>\d+)"
+)
 STAND_IN_MASS, STAND_IN_INERTIA = 0.01, 1e-6
 """Mass in kg and inertia in kg m² that replace an inertia refused by MuJoCo: those of a thing on a
 fingertip."""
@@ -242,22 +244,30 @@ def open_case(
     )
 
 
+def refused_body(error: SceneError) -> str | int | None:
+    """Returns the name of the body whose inertia MuJoCo refuses, or its number if it has no name.
+
+    None if a compilation failed for another reason. Fusing bodies changes their numbers.
+    """
+    found = _REFUSED.search(str(error))
+    return found and (found["name"] or int(found["id"]))
+
+
 def _compile(source: SceneSource, grip: str) -> tuple[Scene, dict[int, str]]:
     """Compiles with a stand-in for each inertia that MuJoCo refuses, so other checks can run."""
-    refused: dict[int, str] = {}
+    refused: dict[str | int, str] = {}
     while True:
         try:
-            return compile_scene(source, grip, warns=False, checks_start=False), refused
+            scene = compile_scene(source, grip, warns=False, checks_start=False)
+            return scene, {int(scene.model.body(key).id): text for key, text in refused.items()}
         except SceneError as error:
-            found = _REFUSED.search(str(error))
-            if found is None or (body_id := int(found[2])) in refused:
+            if (key := refused_body(error)) is None or key in refused:
                 raise
-            refused[body_id] = str(error)
+            refused[key] = str(error)
         spec = source.spec.copy()
-        for each in refused:
-            body = spec.bodies[each]
-            body.explicitinertial, body.mass = True, STAND_IN_MASS
-            body.inertia, body.fullinertia = np.full(3, STAND_IN_INERTIA), np.full(6, np.nan)
+        body = spec.body(key) if isinstance(key, str) else spec.bodies[key]
+        body.explicitinertial, body.mass = True, STAND_IN_MASS
+        body.inertia, body.fullinertia = np.full(3, STAND_IN_INERTIA), np.full(6, np.nan)
         source = replace(source, spec=spec)
 
 

@@ -12,6 +12,7 @@ from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.inventory import VISUAL, geom_uses
 from hapticbridge.scene.fault import Fault, length, number
 from hapticbridge.scene.first_faults import tool_extent
+from hapticbridge.scene.handle import LET_GO
 from hapticbridge.scene.physics import (
     mesh_of,
 )
@@ -90,10 +91,12 @@ def dent_of(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[fl
 
 
 def grip_faults(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Yields a grip far from the tool."""
+    """Yields a grip that is held, or far from the tool."""
     model, scene = case.model, case.scene
     scene.reset()
     site = model.site(scene.grip).id
+    for clause in scene.held:
+        yield Fault("held grip", case.places.site(site), clause, LET_GO)
     tool_bodies, body = case.tool_bodies, int(model.site_bodyid[site])
     mass = model.body_mass[tool_bodies]
     if not mass.sum() > 0:  # it has no centre, and another fault says so

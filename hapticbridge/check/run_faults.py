@@ -9,6 +9,7 @@ import numpy as np
 
 from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.observe import Observation
+from hapticbridge.scene.checks import unmetered_work
 from hapticbridge.scene.contacts import suggested_solref
 from hapticbridge.scene.fault import Fault, number
 
@@ -57,7 +58,9 @@ def run_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             "follow the warning's advice",
         )
     yield from _falling_bodies(case, seen)
-    if seen.environment != "strict" and not np.any(case.model.dof_damping < 0.0):  # told as a pump
+    # negative damping is told as a pump, and wind as unmetered work
+    is_told = np.any(case.model.dof_damping < 0.0) or unmetered_work(case.model)
+    if seen.environment != "strict" and not is_told:
         yield _energy_created(case, seen)
 
 

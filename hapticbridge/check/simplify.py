@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from hapticbridge.check.version import MotionTrace, SceneVariant, census, model_of
+from hapticbridge.scene.compile import unfused_model
 from hapticbridge.scene.physics import IDENTITY, matrix_of, pose_in, quaternion_of, rotation_vector
 
 OTHER_MOTIONS, PICTURE = "in this motion", "with the picture"
@@ -601,7 +602,7 @@ def _keep_inertia(spec: mujoco.MjSpec, bodies: set[str]) -> None:
 
     MuJoCo's ``adopt_inertial`` refuses a scene whose geoms overrule written inertias.
     """
-    compiler, model = spec.compiler, model_of(spec)
+    compiler, model = spec.compiler, unfused_model(spec)
     is_forced = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     if is_forced or compiler.settotalmass > 0:  # overruled or scaled together
         bodies = {body.name for body in spec.bodies}

@@ -21,6 +21,7 @@ from hapticbridge.check.case import (
     IntendedUse,
     SceneUnderCheck,
     open_case,
+    refused_body,
 )
 from hapticbridge.check.cost import TICK_SHARE, Cost, Growth, draw_cost, measure_cost
 from hapticbridge.check.findings import find_faults
@@ -236,7 +237,14 @@ def print_cost(cost: Cost | None) -> None:
     )
 
 
-def print_faults(findings: tuple[Fault, ...]) -> None:
+_IN_URDF = (
+    "this is a URDF: in it <option> and <compiler> go into <mujoco> in <robot>, and MuJoCo reads "
+    "other attributes in MJCF alone, which mujoco.MjSpec.from_file(FILE).to_xml() makes of it"
+)
+"""Way to make the changes of a scene that is not written in MJCF."""
+
+
+def print_faults(findings: tuple[Fault, ...], *, is_urdf: bool) -> None:
     """Prints each fault with its place and the change that mends it, then what is a note."""
     faults = [each for each in findings if not each.is_note]
     notes = [each for each in findings if each.is_note]
@@ -248,6 +256,8 @@ def print_faults(findings: tuple[Fault, ...]) -> None:
     if notes:
         out.print("\n[bold]Worth knowing[/]")
         _print_findings(notes, "to change it")
+    if findings and is_urdf:
+        out.print(plain(_IN_URDF))
 
 
 def _print_findings(faults: list[Fault], lead: str) -> None:
@@ -355,7 +365,11 @@ class Check:
         budget = checked_budget(1.0 if self.budget is None else self.budget)
         with compiling(self.scene):
             source = read_scene(self.scene, **settings_from(self.settings))
-            plain_model(source)
+            try:
+                plain_model(source)
+            except SceneError as error:
+                if refused_body(error) is None:  # else it gets a stand-in
+                    raise
         if self.write is not None:
             check_lean_target(source, self.write, overwrite=self.overwrite)
         period = None if self.rate is None else period_of(self.rate)
@@ -386,7 +400,7 @@ class Check:
             print_case(case)
             print_inventory(inventory, case.contact)
             print_cost(cost)
-            print_faults(faults)
+            print_faults(faults, is_urdf=b"<robot" in source.sources[0].data)
             if is_sound:
                 grip = "" if self.grip == "grip" else f" --grip {shlex.quote(self.grip)}"
                 out.print(f"next: hapticbridge run {plain(shlex.quote(self.scene))}{grip}")

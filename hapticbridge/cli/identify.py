@@ -40,7 +40,7 @@ from hapticbridge.plotting import check_ending
 from hapticbridge.run.options import BridgeOptions
 from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.theory.z_width import ZWidth, z_width
-from hapticbridge.units import format_si
+from hapticbridge.units import format_number, format_si
 
 REPLACED = {"mass", "damping", "friction", "rotational_inertia", "rotational_damping", "delay"}
 """Numbers of a data sheet in whose place a measurement goes."""
@@ -147,7 +147,7 @@ def print_result(
         return
     out.print(
         f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness "
-        f"is {z.limit[0]:.4g} N/m at B_law = 0 "
+        f"is {format_number(z.limit[0])} N/m at B_law = 0 "
         f"({z.corner_limited_by}){_with_more_damping(z)}{_if_in_time(info, z.period)}"
     )
     out.print(f"use {coupling.sentences()[0]}")
@@ -180,7 +180,7 @@ def _with_more_damping(z: ZWidth) -> str:
     at = int(np.argmax(z.limit))
     if z.limit[at] < 1.01 * z.limit[0]:
         return ""
-    return f"; {z.limit[at]:.4g} N/m at B_law = {z.damping[at]:.3g} N s/m"
+    return f"; {format_number(z.limit[at])} N/m at B_law = {z.damping[at]:.3g} N s/m"
 
 
 def why_none(result: Identification) -> str:

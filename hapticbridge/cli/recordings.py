@@ -296,12 +296,15 @@ def _ticks(difference: Difference) -> str:
 
 
 def _size(difference: Difference) -> str:
+    if difference.bits:
+        return ", ".join(difference.bits)
     if difference.size == 0.0:
         return "the sign of zero"
     if not math.isfinite(difference.size):
         return "no number" if any(map(math.isnan, difference.values)) else "infinitely much"
     if difference.unit == "1":
-        return f"{difference.size:.3g}"
+        is_count = all(isinstance(value, int) for value in difference.values)
+        return f"{difference.size:.0f}" if is_count else f"{difference.size:.3g}"
     if difference.unit == "ns":
         return format_si(1e-9 * difference.size, "s")
     return format_si(difference.size, difference.unit)

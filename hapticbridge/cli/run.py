@@ -74,7 +74,7 @@ from hapticbridge.scene.first_faults import worst_faults
 from hapticbridge.scene.physics import tool_masses
 from hapticbridge.scene.rehearsal import static_load
 from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
-from hapticbridge.units import format_energy, format_si
+from hapticbridge.units import format_energy, format_number, format_si
 
 if TYPE_CHECKING:
     from hapticbridge.view import Window
@@ -165,7 +165,7 @@ def _announce_own_rate(setup: RunSetup) -> None:
     if usual.stiffness > setup.coupling.stiffness:
         err.print(
             f"  the device gives {1 / own:.4g} new samples per second, and each force is held: "
-            f"--rate {1 / own:.4g} would allow {usual.stiffness:.3g} N/m"
+            f"--rate {format_number(1 / own)} would allow {format_number(usual.stiffness, 3)} N/m"
         )
 
 
@@ -184,7 +184,7 @@ def _announce_slow(setup: RunSetup) -> None:
     if setup.coupling.stiffness > 2.0 * most:
         err.print(
             "[yellow]warning:[/yellow] at this scene rate the tool may shake above about "
-            f"{2.0 * most:.2g} N/m: lower --stiffness, or raise --scene-rate"
+            f"{format_number(2.0 * most, 2)} N/m: lower --stiffness, or raise --scene-rate"
         )
     most = steady_rotational_stiffness(setup.info, setup.scene_period, *scales)
     if setup.coupling.rotational_stiffness > 2.0 * most:

@@ -40,7 +40,7 @@ from hapticbridge.theory.bounds import (
 )
 from hapticbridge.theory.transfer import MAX_DELAY
 from hapticbridge.theory.z_width import ZWidth, z_width
-from hapticbridge.units import format_si
+from hapticbridge.units import format_number, format_si
 
 _ARGUMENTS = Arguments(HapticBridgeError)
 
@@ -229,7 +229,7 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
         out.print(f"note: {note}")
     (sentence,) = recommended_coupling(z).sentences()
     at, safe = z.corner.damping, z.corner.stiffness / STIFFNESS_MARGIN
-    of = f": 80 % of the {safe:.4g} N/m that are safe at B_law = {at:.3g} N s/m"
+    of = f": 80 % of the {format_number(safe)} N/m that are safe at B_law = {at:.3g} N s/m"
     if z.delay:
         of = f": it needs at most {NEEDED_SHARE:.0%} of b, in every scene"
     out.print(f"use {sentence}{of}")
@@ -266,10 +266,10 @@ def _print_measured(measured: MeasuredWidth) -> None:
     for limit, safe, free in zip(measured.limits, measured.predicted, unheld, strict=True):
         table.add_row(
             f"{limit.damping:.3g} N s/m",
-            f"{limit.borne:.4g} N/m",
-            "not found" if limit.not_borne is None else f"{limit.not_borne:.4g} N/m",
-            f"{safe:.4g} N/m",
-            "mass unknown" if free is None else f"{free:.4g} N/m",
+            f"{format_number(limit.borne)} N/m",
+            "not found" if limit.not_borne is None else f"{format_number(limit.not_borne)} N/m",
+            f"{format_number(safe)} N/m",
+            "mass unknown" if free is None else f"{format_number(free)} N/m",
         )
     out.print("measured on the device, as it was held:")
     out.print(table)
@@ -445,9 +445,9 @@ class Bound:
             most = largest_effective_damping(b, stiffness, period, lag)
             damper = f"lower the damping to {most:.4g} N s/m"
         if self.stiffness * period > 2 * b:
-            changes.append(f"lower the stiffness to {2 * b / period:.4g} N/m")
+            changes.append(f"lower the stiffness to {format_number(2 * b / period)} N/m")
             if (rate := self.stiffness / (2 * b)) <= max_rate:
-                changes.append(f"raise the rate to {rate:.4g} Hz")
+                changes.append(f"raise the rate to {format_number(rate)} Hz")
         out.print("with 15 % in reserve:")
         if damper and changes:
             out.print(f"  {damper}, and {' or '.join(changes)}, or")
@@ -483,4 +483,4 @@ def _hertz(way: Alternative) -> float | None:
 def _where(way: Alternative) -> str:
     if (hertz := _hertz(way)) is None:
         return "every frequency" if math.isfinite(way.needed) else "-"
-    return f"{hertz:.4g} Hz" if hertz else "low frequency"
+    return f"{format_number(hertz)} Hz" if hertz else "low frequency"

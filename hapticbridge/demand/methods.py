@@ -49,6 +49,7 @@ from hapticbridge.theory.bounds import (
     effective_damping,
     law_damping,
 )
+from hapticbridge.units import format_number
 
 Contact = Literal["rigid", "scene"]
 RIGID: Contact = "rigid"
@@ -373,13 +374,12 @@ def _sentence(
     for name, coupling in known.items():
         if name != first:
             other, damping = getattr(coupling, spring), f"{getattr(coupling, damper):.4g}"
+            with_spring = f"{k} = {format_number(other)}, {b} = {damping}"
             is_equal = math.isclose(other, stiffness)
-            others.append(
-                f"{name} {damping if is_equal else f'{k} = {other:.4g}, {b} = {damping}'}"
-            )
+            others.append(f"{name} {damping if is_equal else with_spring}")
     beside = f" ({', '.join([*others, *notes])})" if others or notes else ""
     return (
-        f"{k} = {stiffness:.4g} {spring_unit}, "
+        f"{k} = {format_number(stiffness)} {spring_unit}, "
         f"{b} = {getattr(known[first], damper):.4g} {damper_unit} {first}{beside}"
     )
 

@@ -82,7 +82,7 @@ _REMEDIES = {
 }
 
 _LIMIT_MOTORS = (
-    "the scene's motors {} until then{}: limit their force (forcerange), or start a "
+    "the scene's motors {} until then{}: limit their force (a smaller forcerange), or start a "
     "motor at ctrl 0 and a servo at its target (keyframe 'home'); 'hapticbridge check SCENE' names "
     "those that push at the start; if they are meant to push the hand, --energy-limit is what it "
     "may get"

@@ -8,6 +8,7 @@ import struct
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -248,7 +249,7 @@ def read_bag(path: Path, topic: str = "") -> Motion:
     """
     # imported here, because no other device needs it
     from mcap.exceptions import McapError  # noqa: PLC0415
-    from mcap.reader import make_reader  # noqa: PLC0415
+    from mcap.reader import NonSeekingReader, make_reader  # noqa: PLC0415
 
     kinds = dict(_topics(path))
     poses = [name for name, kind in kinds.items() if kind == POSE]
@@ -270,7 +271,8 @@ def read_bag(path: Path, topic: str = "") -> Motion:
     stamps, logged, numbers = [], [], []
     with path.open("rb") as file:
         try:
-            for _, _, message in make_reader(file).iter_messages(topics=[topic]):
+            reader = make_reader(file) if _index(file) else NonSeekingReader(file)
+            for _, _, message in reader.iter_messages(topics=[topic]):
                 stamp, pose = _pose_of(message.data)
                 stamps.append(stamp)
                 logged.append(message.log_time)
@@ -298,18 +300,47 @@ def _topics(path: Path) -> Iterator[tuple[str, str]]:
         DeviceError: The file is damaged, or its end is missing.
     """
     from mcap.exceptions import McapError  # noqa: PLC0415
-    from mcap.reader import make_reader  # noqa: PLC0415
+    from mcap.records import Channel, Schema  # noqa: PLC0415
+    from mcap.stream_reader import StreamReader  # noqa: PLC0415
 
     try:
         with path.open("rb") as file:
-            summary = make_reader(file).get_summary()
+            if index := _index(file):
+                channels, schemas = index.channels.values(), index.schemas
+            else:
+                records = [r for r in StreamReader(file).records if isinstance(r, Schema | Channel)]
+                channels = [each for each in records if isinstance(each, Channel)]
+                schemas = {each.id: each for each in records if isinstance(each, Schema)}
     except (OSError, McapError, struct.error, *_DAMAGED) as error:
-        raise DeviceError(f"{path}: cannot be read ({error})") from None
-    if summary is None:
-        raise DeviceError(f"{path}: the end of the file is missing")
-    for channel in summary.channels.values():
-        schema = summary.schemas.get(channel.schema_id)
+        reason = str(error) if _ends_whole(path) else _NO_END
+        raise DeviceError(f"{path}: cannot be read ({reason})") from None
+    for channel in channels:
+        schema = schemas.get(channel.schema_id)
         yield channel.topic, schema.name if schema else "no type"
+
+
+_NO_END = "its end is missing or followed by more; 'mcap recover' writes what is whole"
+
+
+def _ends_whole(path: Path) -> bool:
+    """Returns True for a file that ends as an MCAP file does, or cannot be read at all."""
+    from mcap.writer import MCAP0_MAGIC  # noqa: PLC0415
+
+    try:
+        with path.open("rb") as file:
+            file.seek(-len(MCAP0_MAGIC), os.SEEK_END)
+            return file.read() == MCAP0_MAGIC
+    except OSError:
+        return True
+
+
+def _index(file: IO[bytes]) -> Any:
+    """Returns the index of an MCAP file, or None if it has none or no channels in it."""
+    from mcap.reader import make_reader  # noqa: PLC0415
+
+    summary = make_reader(file).get_summary()
+    file.seek(0)
+    return summary if summary is not None and summary.channels else None
 
 
 _ZSTD = b"\x28\xb5\x2f\xfd"

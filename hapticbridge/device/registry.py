@@ -456,8 +456,19 @@ def _named_topic(text: str) -> tuple[Path, str]:
     return bags[0] if len(bags) == 1 else path, f"/{topic}" if is_named else ""
 
 
+_PACKED = "compressed as a whole file; what {} makes of it is read"
+_OTHER_BAGS = {
+    ".db3": "a bag of ROS 2 in SQLite; 'ros2 bag convert' writes it in MCAP, which is read",
+    ".bag": "a bag of ROS 1; 'rosbags-convert --dst-storage mcap' makes it one of ROS 2, in MCAP",
+    ".zstd": _PACKED.format("'zstd -d'"),
+    ".zst": _PACKED.format("'zstd -d'"),
+    ".gz": _PACKED.format("'gunzip'"),
+}
+"""Reason why a file is no motion and what makes it one, by its ending."""
+
+
 def _refuse_other_bag(path: Path) -> None:
-    """Refuses a bag of ROS 2 in SQLite, and a folder of several bags.
+    """Refuses a bag of another kind, and a folder of several bags.
 
     Raises:
         DeviceError: It is one.
@@ -466,10 +477,8 @@ def _refuse_other_bag(path: Path) -> None:
         files = sorted(path.iterdir()) if path.is_dir() else [path]
     except OSError:  # reading it as a motion then reports the reason
         return
-    if any(file.suffix == ".db3" for file in files):
-        raise DeviceError(
-            f"{path}: a bag of ROS 2 in SQLite; 'ros2 bag convert' writes it in MCAP, which is read"
-        )
+    if kind := next((_OTHER_BAGS[file.suffix] for file in files if file.suffix in _OTHER_BAGS), ""):
+        raise DeviceError(f"{path}: {kind}")
     bags = [file.name for file in files if file.suffix == ".mcap"]
     if len(bags) > 1:
         raise DeviceError(f"{path}: a folder of {len(bags)} files; name one of {choices(bags[:8])}")

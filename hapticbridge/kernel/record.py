@@ -121,7 +121,7 @@ each a normal away from the surface, the arm from the grip to the point of the t
 and the gap there in m. ``work`` in J is all that the coupling has done on the program's tool so
 far, 0 where the program applies no wrench."""
 
-FORMAT = "5"
+FORMAT = "6"
 """Format of a recording: its fields, the request with its options, and the numbers that follow from
 it. A recording of another format is refused, so other fields in any of them need the next number.
 
@@ -294,6 +294,9 @@ SECONDS = "seconds"
 
 FLAG_LEGEND = {str(flag.value): flag.name for flag in TickFlag}
 """Names of the bits of the column ``flags``, by value."""
+
+BIT_FIELDS: dict[str, dict[str, str | None]] = {"flags": FLAG_LEGEND, "buttons": {}}
+"""Fields whose numbers are bits, with the bits' names by value as far as they have one."""
 
 
 class TableColumns:

@@ -344,7 +344,7 @@ class DeviceLoop:
             seconds: Time in s; whole ticks of it count, at least one.
 
         Raises:
-            HapticBridgeError: The loop runs in real time.
+            HapticBridgeError: The loop runs in real time, or the time is no number >= 0.
             DeviceLost: It does not answer.
         """
         state = self._newest()
@@ -352,9 +352,9 @@ class DeviceLoop:
             raise HapticBridgeError(
                 "real time goes on by itself; advance() is for is_simulated=True"
             )
-        if not 0.0 < float(numbers_of("seconds", seconds)) <= LONGEST_ADVANCE:
+        if not 0.0 <= float(numbers_of("seconds", seconds)) <= LONGEST_ADVANCE:
             raise HapticBridgeError(
-                f"seconds is {seconds!r}; it must be above 0, up to {LONGEST_ADVANCE:g}"
+                f"seconds is {seconds!r}; it must be 0 to {LONGEST_ADVANCE:g}"
             )
         with self._lock:
             self._call["ticks"] = max(round(seconds / float(state["period"])), 1)

@@ -232,23 +232,45 @@ class Container:
     def __init__(self, data: FileBytes) -> None:
         self._data = data
         self.problems: list[str] = []
-        self._summary, self._end = 0, len(data)
-        footer = len(data) - len(MAGIC) - _FOOTER_SIZE
-        self.is_cut = not (
-            footer >= len(MAGIC)
-            and data[-len(MAGIC) :] == MAGIC
-            and _RECORD.unpack(data[footer : footer + _RECORD.size])
-            == (Opcode.FOOTER, _FOOTER.size)
-        )
+        self._summary, self._end, self.is_cut = 0, len(data), True
         self._chunks: list[int] = []
-        if not self.is_cut:
-            self._end = footer
+        footer = len(data) - len(MAGIC) - _FOOTER_SIZE
+        if self._is_end(footer):
             self._read_footer(footer)
+        if self.is_cut or self.problems:
+            self._look_behind(footer)
+
+    def _is_end(self, footer: int) -> bool:
+        """Returns True if a footer is here, and the magic behind it."""
+        head = self._data[max(footer, 0) : footer + _RECORD.size]
+        after = footer + _FOOTER_SIZE
+        return (
+            footer >= len(MAGIC)
+            and head == _RECORD.pack(Opcode.FOOTER, _FOOTER.size)
+            and self._data[after : after + len(MAGIC)] == MAGIC
+        )
+
+    def _look_behind(self, last: int) -> None:
+        """Takes a whole file's end for the end if there are bytes behind it."""
+        found, self.problems = self.problems, []
+        bodies = (body for _, body, _ in self._walk(len(MAGIC), len(self._data), []))
+        first = next(filter(self._is_end, (body - _RECORD.size for body in bodies)), last)
+        self.problems = found
+        if first == last:
+            return
+        self.problems, self._chunks = [], []
+        self._read_footer(first)
+        end = first + _FOOTER_SIZE + len(MAGIC)
+        more = len(self._data) - end
+        self.problems.append(
+            f"its end is followed by {more} more byte{'s' * (more > 1)} ('truncate -s {end}' takes "
+            "them away)"
+        )
 
     def _read_footer(self, footer: int) -> None:
+        self._end, self.is_cut = footer, False
         start, _, crc = _FOOTER.unpack(self._data[footer + _RECORD.size : footer + _FOOTER_SIZE])
-        if start == 0 and crc == 0:
-            return
+        start = start or footer  # without an index the checksum is that of the footer
         if not len(MAGIC) <= start <= footer or (
             crc and self._data.checksum(start, self._end + _FOOTER_SIZE - 4) != crc
         ):

@@ -487,7 +487,8 @@ def _read_through(
         # a file cut inside its first chunk has no schema yet, but has metadata
         if contents.refusal or contents.meta is None or not container.is_cut:
             lacks = f"it has no topic {layout.TICK_TOPIC}"
-            reason = contents.refusal or "; ".join([lacks, *contents.problems[:1]])
+            cut = [CUT] if container.is_cut else []
+            reason = contents.refusal or "; ".join([lacks, *cut, *contents.problems[:1]])
             raise RecordingError(f"{path} is not a recording that can be read: {reason}")
     elif contents.meta is None:
         contents.problems.append(f"the metadata record '{layout.METADATA_NAME}' is missing")

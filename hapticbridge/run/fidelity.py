@@ -175,7 +175,8 @@ class Fidelity:
                 f"without a hand, the scene diverges here within {self.seconds:.2g} s, and not "
                 f"under the file's own options ({step})"
             )
-        more = f", and {len(others)} more bodies deviate" if others else ""
+        ending = "ies deviate" if len(others) > 1 else "y deviates"
+        more = f", and {len(others)} more bod{ending}" if others else ""
         cause = " and ".join(each.value for each in self.causes)
         if self.constraint and {Cause.CONTACT, Cause.DIAGONAL} & set(self.causes):
             cause += f", here of {self.constraint}"
@@ -192,7 +193,9 @@ class Fidelity:
         if not self.incomparable:
             return ""
         first, *others = self.incomparable
-        more = f" and of {len(others)} more bodies" if others else ""
+        more = (
+            f" and of {len(others)} more bod{'ies' if len(others) > 1 else 'y'}" if others else ""
+        )
         return (
             f"without a hand, the place of '{first}'{more} after {self.seconds:.2g} s depends on "
             f"the file's time step of {format_si(self.step, 's')}: with half of it, it is about as "

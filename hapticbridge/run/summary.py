@@ -398,12 +398,13 @@ class Summary:
         for name, text in energy_rows(self.energies, self.start_potential, self.credit):
             of_tank = ", what the program may still give to the hand" if name == "tank" else ""
             yield name, text + of_tank
+        so_far = "with the tick that tripped, " if self.trip else ""  # the record is without it
         if self.max_net_energy > INSTANT:
-            yield "net to the hand", self.hand_energy.sentence
+            yield "net to the hand", so_far + self.hand_energy.sentence
         elif not self.credit and (release := self.hand_energy.release):
             yield "scene's storage", release
         if blur := self.hand_energy.blur:
-            yield "encoder steps", blur
+            yield "encoder steps", so_far + blur
 
     @property
     def max_net_energy(self) -> float:

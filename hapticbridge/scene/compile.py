@@ -45,6 +45,24 @@ PROGRAM_CREDIT = "another_programs_credit"
 """Custom number of a scene that another program steps: what it may give to a hand, in J."""
 
 
+def unfused_model(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compiles a copy in which bodies without joints are not fused with their parents.
+
+    Each body of the specification is then one of the model, with its own mass. MuJoCo fuses those
+    of a URDF, and those of a scene with ``fusestatic``. A free joint below one of them becomes a
+    ball joint, as MuJoCo takes no free joint there.
+    """
+    copy = spec.copy()
+    if copy.compiler.fusestatic:
+        copy.compiler.fusestatic = False
+        for joint in copy.joints:
+            if joint.type == mujoco.mjtJoint.mjJNT_FREE and joint.parent.parent.id:
+                joint.type = mujoco.mjtJoint.mjJNT_BALL
+        for key in list(copy.keys):  # they have the size of the free joints
+            copy.delete(key)
+    return copy.compile()
+
+
 # Start of a scene, with the handle at the grip
 
 START_KEYFRAME = "home"

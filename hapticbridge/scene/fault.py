@@ -39,6 +39,7 @@ FAILS = {
     "falling body": False,
     "far grip": False,
     "heavy tool": False,
+    "held grip": False,
     "keyframe": False,
     "margin": False,
     "mass ratio": False,

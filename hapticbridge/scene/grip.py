@@ -1,9 +1,10 @@
 """Grip of a scene: the site, or the point of a body, that the hand holds.
 
 A grip is the name of a site, the name of a body, or ``BODY@x,y,z`` with a point in m in the body's
-frame. A body alone is held at its centre of mass, and a body without a name goes by its number. For
-a body, a site is added whose name is the grip as written, so a recording and a what-if find it by
-that name. If a site and a body share a name, the site is the grip.
+frame. A body alone is held at its centre of mass, or at its origin if it has no mass, and a body
+without a name goes by its number. For a body, a site is added whose name is the grip as written, so
+a recording and a what-if find it by that name. If a site and a body share a name, the site is the
+grip.
 
 ``joint:NAME`` is a hinge or slide, which a hand moves along its one axis, as a grip axis does. No
 site is held by a name that begins so.
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.codes import Grip
-from hapticbridge.scene.compile import reset
+from hapticbridge.scene.compile import reset, unfused_model
 
 MAX_OFFERED = 4
 """Number of grips that a refusal names. More would make its sentence too long to read."""
@@ -121,14 +122,14 @@ def _points(
         if model.body_weldid[body_id] == 0:
             continue
         name, jacobian = model.body(body_id).name or str(body_id), np.zeros((3, model.nv))
-        yield "body", name, body_id, data.xipos[body_id]
+        matrix = data.xmat[body_id].reshape(3, 3)
+        yield "body", name, body_id, data.xpos[body_id] + matrix @ _centre(model, body_id)
         mujoco.mj_jacBodyCom(model, data, jacobian, None, body_id)
         if (
             np.abs(jacobian).max(initial=0.0) < ON_AXIS
             and (rim := _rim(model, body_id)) is not None
         ):
             text = ",".join(f"{value:.3g}" for value in rim)
-            matrix = data.xmat[body_id].reshape(3, 3)
             yield "body", f"{name}@{text}", body_id, data.xpos[body_id] + matrix @ rim
 
 
@@ -147,7 +148,16 @@ def _rim(model: mujoco.MjModel, body_id: int) -> NDArray[np.float64] | None:
     across /= np.linalg.norm(across)
     mujoco.mju_quat2Mat(matrix, model.geom_quat[largest])
     reach = np.abs(matrix.reshape(3, 3).T @ across) @ model.geom_aabb[largest, 3:]
-    return np.asarray(model.body_ipos[body_id] + reach * across) if reach > 0.0 else None
+    return np.asarray(_centre(model, body_id) + reach * across) if reach > 0.0 else None
+
+
+def _centre(model: mujoco.MjModel, body_id: int) -> NDArray[np.float64]:
+    """Returns the centre of mass in m in a body's frame, or its origin if it has no mass.
+
+    For a body without mass MuJoCo's ``body_ipos`` is the place of the body in its parent.
+    """
+    has_mass = model.body_mass[body_id] > 0.0
+    return np.array(model.body_ipos[body_id] if has_mass else np.zeros(3))
 
 
 def add_grip(spec: mujoco.MjSpec, grip: str) -> list[str]:
@@ -173,15 +183,14 @@ def add_grip(spec: mujoco.MjSpec, grip: str) -> list[str]:
             f"'{grip}' is a site and a body, and the hand holds the site; '{grip}@0,0,0' is the "
             "body at its origin"
         ]
-    model = spec.copy().compile()
-    if len(spec.bodies) == model.nbody:  # not if MuJoCo fused bodies
+    if not spec.compiler.fusestatic:  # which changes their numbers
         bodies |= {str(i): body for i, body in enumerate(spec.bodies) if not body.name}
     name, is_point, text = (grip, "", "") if grip in bodies else grip.rpartition("@")
     if name not in bodies:
-        raise SceneError(_offer(model, grip))
-    body = bodies[name]
+        raise SceneError(_offer(spec.copy().compile(), grip, bodies))
+    body, model = bodies[name], unfused_model(spec)
     body_id = model.body(name).id if body.name else int(name)
-    point = _point_of(grip, text) if is_point else model.body_ipos[body_id].tolist()
+    point = _point_of(grip, text) if is_point else _centre(model, body_id).tolist()
     site = body.add_site(name=grip)
     # every field that places it, so that no <default> of the scene applies
     site.pos, site.quat, site.fromto = point, (1.0, 0.0, 0.0, 0.0), np.full(6, np.nan)
@@ -210,8 +219,12 @@ def _point_of(grip: str, text: str) -> list[float]:
     return point
 
 
-def _offer(model: mujoco.MjModel, grip: str) -> str:
-    offered = grips(model)
+def _offer(model: mujoco.MjModel, grip: str, bodies: Container[str]) -> str:
+    offered = [
+        each
+        for each in grips(model)
+        if each.kind == "site" or each.name in bodies or each.name.rpartition("@")[0] in bodies
+    ]
     head = f"the scene has no site or body '{grip}' to hold"
     if not offered:
         return f"{head}, and nothing in it can move; give a body a joint"

@@ -438,6 +438,9 @@ HELD = 1e-6
 """Way of a grip in a motion of unit size, in m, below which constraints hold it. Rounding leaves
 1e-12 of way; a softer hinge of the tool moves by its lever, of a mm or more."""
 
+LET_GO = 'active="false" at its weld or connect'
+"""Change by which a held grip can move."""
+
 _HOLDING = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
 
 
@@ -458,16 +461,23 @@ def take_over_mocap(
 
     Returns:
         The change, as ``name: old → new``, and clauses on constraints that leave the grip a part of
-        its motion.
+        its motion, or by which the fixed world leaves it none.
 
     Raises:
         SceneError: A change is needed that ``as_is`` forbids.
     """
-    held = [i for i in np.flatnonzero(model.eq_active0).tolist() if _mocap_of(model, i)]
-    if not held:
+    active = np.flatnonzero(model.eq_active0).tolist()
+    held = [i for i in active if _mocap_of(model, i)]
+    # a body without a tree is fixed, or a mocap body
+    fixed = [i for i in active if -1 in model.body_treeid[list(_tied_bodies(model, i))]]
+    if not fixed:
         return (), []
     data = mujoco.MjData(model)
     go_to_start(model, data, grip)
+    if not held:
+        free, kept = (_motions(model, data, grip, without) for without in (fixed, []))
+        is_fast = _rank(free) > _rank(kept) == 0
+        return (), ["the grip is held fast by a weld or connect to the world"] * is_fast
     free, kept = (_motions(model, data, grip, without) for without in (held, []))
     is_held = _rank(kept[:3]) < min(2, _rank(free[:3]))
     for i in held.copy():  # the fewest that must go
@@ -477,13 +487,13 @@ def take_over_mocap(
     if not held:
         return (), []
     more = f" and {len(held) - 1} more" if len(held) > 1 else ""
-    name, lines = _mocap_of(model, held[0]), 'active="false" at its weld or connect'
+    name = _mocap_of(model, held[0])
     if not is_held:
-        part = f"{_rank(kept)} of {_rank(free)} of its motions; to let it go write {lines}"
+        part = f"{_rank(kept)} of {_rank(free)} of its motions"
         return (), [f"mocap body '{name}'{more} holds the tool and leaves the grip {part}"]
     if as_is:
         raise SceneError(
-            f"grip '{grip}' is held in place by mocap body '{name}'{more}; write {lines}, or let "
+            f"grip '{grip}' is held in place by mocap body '{name}'{more}; write {LET_GO}, or let "
             "the hand replace that body (without --as-is)"
         )
     for i in held:

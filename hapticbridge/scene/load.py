@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -34,6 +35,7 @@ from hapticbridge.scene.compile import (
 )
 from hapticbridge.scene.grip import add_grip
 from hapticbridge.scene.handle import (
+    LET_GO,
     announce_overlaps,
     attach_handles,
     exclude_nested,
@@ -295,7 +297,7 @@ def _limit_memory(spec: mujoco.MjSpec) -> tuple[SceneChange, ...]:
         return ()
     spec.memory, spec.nstack, spec.njmax, spec.nconmax = MAX_MEMORY, -1, -1, -1
     asked = format_si(before, "B") if before > MAX_MEMORY else f"for {rows} rows"
-    return (SceneChange(f"memory: {asked} → {format_si(MAX_MEMORY, 'B')}", "memory"),)
+    return (SceneChange(f"memory: {asked} → {_memory(MAX_MEMORY)}", "memory"),)
 
 
 def _compiled(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, tuple[SceneChange, ...]]:
@@ -305,8 +307,13 @@ def _compiled(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, tuple[SceneChange, .
         return model, ()
     before, spec.memory, spec.nstack, spec.njmax = model.narena, -1, -1, -1
     model = spec.compile()
-    sizes = (format_si(size, "B") for size in (before, model.narena))
-    return model, (SceneChange(f"memory: {' → '.join(sizes)}", "memory"),)
+    words = f"memory: {format_si(before, 'B')} → {_memory(model.narena)}"
+    return model, (SceneChange(words, "memory"),)
+
+
+def _memory(size: int) -> str:
+    """Returns a size in bytes, and as <size> takes it, in whole 2^20 bytes."""
+    return f'{format_si(size, "B")} (memory="{math.ceil(size / (1 << 20))}M")'
 
 
 MIN_MEMORY = 13 << 20
@@ -366,11 +373,13 @@ def compile_scene(
             changes, model = changes + excluded, spec.compile()
         concerns = [each + MAY_BE_ACTIVE for each in unmetered_work(model).values()]
         concerns += about_grip
+        held = list[str]()
         for each in dict.fromkeys(grips):
             check_model(model, each)
         for each in dict.fromkeys(grips):
             replaced, holding = take_over_mocap(spec, model, each, as_is=as_is)
-            changes, concerns = changes + replaced, [*concerns, *holding]
+            changes, held = changes + replaced, [*held, *holding]
+        concerns += [f"{each}; to let it go write {LET_GO}" for each in held]
         model, started, remaining = _start_set(spec, model, source, as_is=as_is)
         changes, concerns = changes + started, [*concerns, *remaining]
         seat_handle(model, grips[0])
@@ -378,7 +387,7 @@ def compile_scene(
         scene = Scene(
             path, grips[0], model, data, source.sources, values, changes, as_is, _spec=spec
         )
-        scene.other_grips = grips[1:]
+        scene.other_grips, scene.held = grips[1:], tuple(held)
         scene.reset()
         for each in dict.fromkeys(grips):
             scene.differences += limit_motors_alone(model, scene.data, each, as_is=as_is)
@@ -424,5 +433,16 @@ def _found_nowhere(path: Path, error: Exception) -> str:
     """Returns MuJoCo's words; of a file that it does not find, with the folder it looked in."""
     if str(error).startswith("Error: Error opening file"):  # MuJoCo's own
         places = f"'{path.resolve().parent}' and its meshdir or texturedir, if it names one"
+        with suppress(OSError):
+            if "'package:" in str(error):
+                places += (
+                    '; MuJoCo resolves no package://, but <mujoco><compiler strippath="true" '
+                    'meshdir="FOLDER"/></mujoco> in <robot> finds the bare names in FOLDER'
+                )
+            elif b"<include" in path.read_bytes():
+                places += (
+                    '; for the files of a part <compiler meshdir="FOLDER"/> behind its <include> '
+                    "counts, with FOLDER seen from here"
+                )
         return f"{clause(error)}, looked for in {places}"
     return clause(error)

@@ -116,6 +116,7 @@ class Scene:
         as_is: True if the scene must not be changed to be felt.
         is_carried: True if the weight of the tool is compensated (``carry_tool``).
         other_grips: Names of the sites that further hands hold.
+        held: Clauses on constraints that leave a grip few of its motions, or none.
         hand: Number of the hand that holds ``grip``, from 0 (``of_hand``).
         findings: Sentences on faults of the scene that the user was warned of. The recording keeps
             them as events.
@@ -131,6 +132,7 @@ class Scene:
     as_is: bool = False
     is_carried: bool = False
     other_grips: tuple[str, ...] = ()
+    held: tuple[str, ...] = ()
     hand: int = 0
     findings: tuple[str, ...] = ()
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 
+from hapticbridge.kernel.codes import PREFIX
 from hapticbridge.scene import SceneSource
 from hapticbridge.scene.source import Element, read_elements
 
@@ -161,7 +163,7 @@ class Places:
         if name and (found := self._first(tags, lambda e: e.attributes.get("name") == name)):
             return Place(found.file, found.line, label)
         elements = list(getattr(self._spec, _LISTS.get(kind, f"{kind}s")))
-        if index >= len(elements) or str(elements[index].name) != name:
+        if index >= len(elements) or not self._has_numbers_of(kind, elements, index):
             return Place(self._main, 0, label)
         line = _line(elements[index])
         if line:
@@ -176,6 +178,16 @@ class Places:
         if index in nameless and len(nameless) == len(included):
             return Place(*included[nameless.index(index)], label)
         return Place(self._main, 0, label)
+
+    def _has_numbers_of(self, kind: str, elements: list[Any], index: int) -> bool:
+        """Returns False if elements up to this one were fused or dropped by the compiler."""
+        names = list[str]()
+        with suppress(IndexError):
+            while True:
+                names.append(str(getattr(self._model, kind)(len(names)).name))
+        names = [name for name in names if not name.startswith(PREFIX)]
+        written = [str(each.name) for each in elements]
+        return len(names) >= len(written) and names[: index + 1] == written[: index + 1]
 
     def _first(self, tags: tuple[str, ...], fits: Callable[[Element], bool]) -> Place | None:
         """Returns the first element with one of some tags, or with any if there are none."""

@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import finite_or_null
-from hapticbridge.kernel.record import CLOCK_FIELDS, TICK_DTYPE, Column, TickFlag, columns_of
+from hapticbridge.kernel.record import (
+    BIT_FIELDS,
+    CLOCK_FIELDS,
+    TICK_DTYPE,
+    Column,
+    TickFlag,
+    columns_of,
+)
 from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
 from hapticbridge.run.commands import CHANGES as COMMANDED
@@ -32,6 +39,7 @@ class Difference:
         column: Column of the record.
         unit: Unit of the column.
         values: Value in each run.
+        bits: Names of the bits that differ, where the values are bits; else empty.
     """
 
     time: float
@@ -39,10 +47,13 @@ class Difference:
     column: str
     unit: str
     values: tuple[float, float]
+    bits: tuple[str, ...] = ()
 
     @property
     def size(self) -> float:
-        """|a − b|; infinite if one of them is not a number."""
+        """|a − b|, infinite if one of them is not a number; of bits the count that differs."""
+        if self.bits:
+            return float(len(self.bits))
         a, b = self.values
         size = abs(a - b)
         return size if np.isfinite(size) else np.inf
@@ -257,6 +268,8 @@ class _Found:
                 continue
             with np.errstate(invalid="ignore", over="ignore"):
                 size = np.abs(x.astype(np.float64) - y.astype(np.float64))
+            if column.field in BIT_FIELDS:
+                size = np.bitwise_count(x.view(np.int64) ^ y.view(np.int64)).astype(np.float64)
             size = np.where(unequal, np.where(np.isfinite(size), size, np.inf), -1.0)
             at = int(np.argmax(unequal))
             if earliest is None or at < earliest[0]:
@@ -274,7 +287,12 @@ class _Found:
         ticks = int(a["tick"][at]), int(b["tick"][at])
         values = _numbers(a, column)[at].item(), _numbers(b, column)[at].item()
         time = ticks[0] * self._periods[0]
-        return Difference(time, ticks, column.name + self._of_hand, column.unit, values)
+        bits: tuple[str, ...] = ()
+        if (names := BIT_FIELDS.get(column.field)) is not None:
+            changed = int(values[0]) ^ int(values[1])
+            changed_bits = [bit for bit in range(64) if changed >> bit & 1]
+            bits = tuple(names.get(str(1 << bit)) or f"bit {bit}" for bit in changed_bits)
+        return Difference(time, ticks, column.name + self._of_hand, column.unit, values, bits)
 
 
 def _with_nearest_quaternions(a: NDArray[np.void], b: NDArray[np.void]) -> NDArray[np.void]:

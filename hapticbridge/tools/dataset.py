@@ -109,9 +109,9 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
         SENSORS: tuple(found["sensor_names"]),
         ACTION: (*POSE, *WRENCH),
     }
-    for name in (CTRL, SENSORS):
-        if not names[name]:
-            del values[name], names[name]
+    for column in (CTRL, SENSORS):
+        if not names[column]:
+            del values[column], names[column]
     return Episode(
         name=name,
         scene=recording.meta.get("scene", ""),

@@ -27,7 +27,13 @@ from hapticbridge.report.evidence import (
 )
 from hapticbridge.report.page import moment_of, write_page
 from hapticbridge.report.plots import PAGE_BINS, PICTURE_BINS, decimated, finish
-from hapticbridge.units import format_energy, format_share, format_si, shown_energies
+from hapticbridge.units import (
+    format_energy,
+    format_number,
+    format_share,
+    format_si,
+    shown_energies,
+)
 from hapticbridge.whatif.what_if import WhatIf, WhatIfRun
 
 if TYPE_CHECKING:
@@ -50,7 +56,9 @@ def rows(what_if: WhatIf) -> Iterator[Row]:
                 yield (
                     f"{name} K, B" + (f" at '{grip}'" if grip else ""),
                     tuple(
-                        f"{c.stiffness:.4g} N/m, {c.damping:.4g} N s/m" if c else "unknown"
+                        f"{format_number(c.stiffness)} N/m, {c.damping:.4g} N s/m"
+                        if c
+                        else "unknown"
                         for c in couplings
                     ),
                 )
