@@ -353,9 +353,7 @@ class DeviceLoop:
                 "real time goes on by itself; advance() is for is_simulated=True"
             )
         if not 0.0 <= float(numbers_of("seconds", seconds)) <= LONGEST_ADVANCE:
-            raise HapticBridgeError(
-                f"seconds is {seconds!r}; it must be 0 to {LONGEST_ADVANCE:g}"
-            )
+            raise HapticBridgeError(f"seconds is {seconds!r}; it must be 0 to {LONGEST_ADVANCE:g}")
         with self._lock:
             self._call["ticks"] = max(round(seconds / float(state["period"])), 1)
             self._send(Call.ADVANCE)
