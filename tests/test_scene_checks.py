@@ -79,7 +79,7 @@ def test_scene_may_use_any_name_but_under_our_prefix(tmp_path: Path) -> None:
     names = ("handle", *(name.removeprefix(PREFIX) for name in COUPLING_ACTUATORS))
     motors = "".join(f"<motor name='{name}' joint='handle'/>" for name in names)
     world = "<site name='handle'/><body name='hapticbridge'/>"
-    weld = "<equality><weld name='handle_weld' body1='handle'/></equality>"
+    weld = "<equality><weld name='handle_weld' body1='handle' active='false'/></equality>"
     text = mjcf(f"<actuator>{motors}</actuator>{weld}", body=body, world=world)
     model = load_scene(scene_file(tmp_path, text)).model
     assert coupling_ids(model) == tuple(range(7, 13))

@@ -29,6 +29,7 @@ from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.commands import Couple, Reset
 from hapticbridge.run.options import RunSetup, steady_stiffness
 from hapticbridge.scene import load_scene
+from hapticbridge.units import format_number
 from hapticbridge.whatif import what_if
 from hapticbridge.whatif.replayed_hand import load_bridge_code
 
@@ -531,7 +532,9 @@ def test_the_command_line_warns_above_twice_the_steady_stiffness(call: Called) -
     for share, warns in ((0.98, False), (1.02, True)):
         code, _, err = call(*run, "--stiffness", share * limit)
         assert code == 0
-        assert (f"may shake above about {limit:.2g} N/m" in " ".join(err.split())) == warns
+        assert (
+            f"may shake above about {format_number(limit, 2)} N/m" in " ".join(err.split())
+        ) == warns
 
 
 def test_the_command_line_warns_of_a_stiffness_that_lets_the_tool_shake_in_turns(
