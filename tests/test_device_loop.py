@@ -156,6 +156,7 @@ def test_each_mistake_of_a_program_gets_a_sentence() -> None:
             ([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], r"norm 0; it must be 1, in the order \(w, x"),
             ("here", "must be numbers"),
             (np.diag([2.0, 1.0, 1.0, 1.0]), "is no rotation"),
+            (np.eye(4) + np.eye(4)[[3, 0, 1, 2]] * 0.1, "last row of the pose's matrix is"),
             (np.diag([-1.0, 1.0, 1.0, 1.0]), "is no rotation"),
         ):
             with pytest.raises(HapticBridgeError, match=words):
@@ -294,6 +295,51 @@ def test_a_loop_is_opened_once() -> None:
         with pytest.raises(HapticBridgeError, match="opened once; make another one"):
             device.open()
         device.close()
+
+
+def test_simulated_time_goes_on_while_another_thread_shows_without_end() -> None:
+    with DeviceLoop("simulated", is_simulated=True) as device:
+        device.show(START)
+        is_over = threading.Event()
+
+        def shows() -> None:
+            while not is_over.is_set():
+                device.show(START)
+                device.pose()
+
+        thread = threading.Thread(target=shows)
+        thread.start()
+        try:
+            for _ in range(20):
+                device.advance(0.01)
+        finally:
+            is_over.set()
+            thread.join()
+
+
+def test_a_tool_that_was_surely_put_elsewhere_is_doubted_once() -> None:
+    with DeviceLoop("simulated", is_simulated=True) as device:
+        device.show(START)
+        device.show(START + np.eye(7)[0] * 0.1)
+        device.show(-START, is_placed=True)
+        with pytest.warns(UserWarning, match=r"0\.447 m from the pose before: .*is_placed=True"):
+            device.show(START)
+        device.show(-START)
+    with (
+        DeviceLoop("simulated", is_simulated=True) as device,
+        pytest.warns(UserWarning, match="positions are in m"),
+    ):
+        device.show([0.0, 0.0, 100.0])
+    assert device.credit == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(("rate", "is_told"), [(50.0, False), (500.0, True)])
+def test_another_rate_than_the_stated_one_is_told(
+    rate: float, is_told: bool, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with DeviceLoop("simulated", is_simulated=True, scene_rate=rate) as device:
+        followed(device, 2.5)
+    assert ("shows its tool 50" in capfd.readouterr().err) == is_told
 
 
 # Frames

@@ -44,13 +44,16 @@ ANSWER_TIME = 30.0
 REPEAT = 0.05
 """Time in s after which a call without an answer is sent again."""
 
+FAR = 0.2
+"""Distance in m between two poses from which on a tool was probably put there."""
+
 DOUBTFUL = 0.5
 """Energy in J, beyond what the hand gave, from which on a program's wrench is doubtful."""
 
 UNPAID = (
     f"the wrench has moved the tool by {DOUBTFUL:g} J that the hand did not give: the tool's pose "
-    "may be a step old (in MuJoCo, call mj_kinematics before wrench()), or the step too long for "
-    "so light a tool"
+    "may be a step old (in MuJoCo, call mj_kinematics before wrench()), its steps not in time with "
+    "the clock, or too long for so light a tool"
 )
 
 LONGEST_ADVANCE = 1e4
@@ -289,6 +292,8 @@ class DeviceLoop:
         post = self._post(pose, velocity, surfaces)
         with self._lock:
             post["work"] = self._call["post"]["work"]
+            if not is_placed:
+                self._doubt(post["pose"][0, :3])
             self._shown = post["pose"][0].copy()
             if is_placed:  # no wrench has brought it there
                 self._applied = np.zeros(6)
@@ -357,6 +362,7 @@ class DeviceLoop:
         with self._lock:
             self._call["ticks"] = max(round(seconds / float(state["period"])), 1)
             self._send(Call.ADVANCE)
+            call = packed(self._call, self._token)
             wanted = int(self._call["sequence"][0])
         end = time.monotonic() + ANSWER_TIME
         repeat = time.monotonic() + REPEAT
@@ -364,8 +370,7 @@ class DeviceLoop:
             self._newest()
             if time.monotonic() > repeat:  # the same call, so that it counts once
                 repeat = time.monotonic() + REPEAT
-                with self._lock:
-                    self._transmit()
+                self._transmit(call)
             if time.monotonic() > end:
                 raise DeviceLost(f"the device loop does not answer for {ANSWER_TIME:g} s")
             self._has_state.wait(REPEAT)
@@ -374,7 +379,7 @@ class DeviceLoop:
     @property
     def credit(self) -> float:
         """Energy in J that the program may still give to the hand: what the tank has."""
-        return float(self._newest()["credit"])
+        return float(self._state["credit"])
 
     @property
     def work(self) -> float:
@@ -437,6 +442,19 @@ class DeviceLoop:
             post["arms"][0, part], post["gaps"][0, k] = point - own[:3], gap
         return post
 
+    def _doubt(self, position: Array) -> None:
+        """Warns once of a tool that is shown where none is likely to be."""
+        step = float(np.linalg.norm(position - self._shown[:3])) if self._has_shown else 0.0
+        if self._has_warned or (step < FAR and np.abs(position).max() < 100.0 * FAR):
+            return
+        self._has_warned = True
+        warnings.warn(
+            f"the tool is shown at {position.round(3).tolist()} m, {step:.3g} m from the pose "
+            "before: positions are in m, and is_placed=True says that a tool was put elsewhere, as "
+            "after a reset",
+            stacklevel=3,
+        )
+
     def _handle_in(self, state: np.void) -> tuple[Array, Array]:
         """Returns pose and velocity of the handle; until it is placed, those that it will have."""
         if int(state["placed"]) < self._placed:
@@ -453,12 +471,12 @@ class DeviceLoop:
     def _send(self, call: Call) -> None:
         self._call["sequence"] += 1
         self._call["call"] = call
-        self._transmit()
+        self._transmit(packed(self._call, self._token))
 
-    def _transmit(self) -> None:
+    def _transmit(self, data: bytes) -> None:
         if self._socket is not None:
             with suppress(OSError):  # a network that is away may come back
-                self._socket.send(packed(self._call, self._token))
+                self._socket.send(data)
 
     def _listen(self, channel: socket.socket) -> None:
         while not self._is_closed:

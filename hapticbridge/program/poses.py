@@ -40,6 +40,11 @@ def pose_of(pose: ArrayLike, orientation: Array) -> Array:
     """
     numbers = numbers_of("pose", pose)
     if numbers.shape == (4, 4):
+        if not np.allclose(numbers[3], (0.0, 0.0, 0.0, 1.0), atol=ROUNDED):
+            raise HapticBridgeError(
+                f"the last row of the pose's matrix is {numbers[3].tolist()}; it must be 0 0 0 1, "
+                "with the position in the last column"
+            )
         turn = numbers[:3, :3]
         if not np.allclose(turn @ turn.T, np.eye(3), atol=ROUNDED) or np.linalg.det(turn) < 0.0:
             raise HapticBridgeError(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+import warnings
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import replace
@@ -59,6 +60,9 @@ SPEED_TIME = 0.01
 
 STOP_LOOK = 0.1
 """Time in s between two looks for a request to end the run, while simulated time stands still."""
+
+RATE_TIME, RATE_RATIO = 2.0, 3.0
+"""Time in s over which a program's rate is looked at, and largest ratio to the stated one."""
 
 LAST_WORDS = 0.3
 """Time in s for which the end of the run is told again, because a datagram may be lost."""
@@ -193,7 +197,9 @@ class Endpoint:
         self.address: tuple[str, int] = self._socket.getsockname()[:2]
         self._token, self._on_leave, self._on_begin = token, on_leave, on_begin
         self._peer: Any = None
-        self._calls: dict[int, int] = {}  # of each program, the number of its newest call
+        # of each program, the number of its newest call, and of its newest ADVANCE
+        self._calls: dict[tuple[int, bool], int] = {}
+        self._shows, self._since, self._has_warned = 0, 0, False
         self._placed = 0, 0  # number of the call, and tick after which it is done
         self._thread = threading.Thread(target=self._work, name="endpoint", daemon=True)
         self._told = np.zeros(1, STATE_DTYPE)
@@ -205,6 +211,7 @@ class Endpoint:
         self._bridge, session = bridge, bridge.session
         assert session.posted is not None  # the scene is that of ``posted_scene``
         self._scene, parameters = session.posted, session.parameters
+        self._scene_period = parameters.scene_period
         self._ratio = parameters.force_scale / parameters.scale
         self._is_absolute = bridge.setup.workspace.absolute
         self._told["period"], coupling = parameters.period, bridge.setup.coupling
@@ -262,9 +269,10 @@ class Endpoint:
                 self._socket.sendto(STRANGER, peer)
             return
         program, number, kind = int(call["program"]), int(call["sequence"]), int(call["call"])
-        if number <= self._calls.get(program, 0):
+        key = program, kind == Call.ADVANCE  # a later pose does not take back an earlier grant
+        if number <= self._calls.get(key, 0):
             return
-        self._calls[program] = number
+        self._calls[key] = number
         if program != self._told["program"]:
             if kind != Call.GREET:
                 self._refuse(program, peer)
@@ -288,11 +296,31 @@ class Endpoint:
             if kind == Call.PLACE and self._told["placed"] == self._placed[0]:
                 self._placed = number, self._bridge.session.tick + 1
             self._scene.post(post)
+            self._check_rate()
+
+    def _check_rate(self) -> None:
+        """Warns once of a program that shows its tool much more or less often than was said."""
+        tick = self._bridge.session.tick
+        if self._shows == 0:
+            self._since = tick
+        self._shows += 1
+        seconds = (tick - self._since) * float(self._told["period"][0])
+        if seconds < RATE_TIME or self._has_warned:
+            return
+        self._has_warned = True
+        stated, found = 1.0 / self._scene_period, (self._shows - 1) / seconds
+        if not 1.0 / RATE_RATIO < found / stated < RATE_RATIO:
+            warnings.warn(
+                f"the program shows its tool {found:.3g} times per second, and the loop was set up "
+                f"for {stated:.3g} (scene_rate): the usual stiffness and the patience are for that",
+                stacklevel=2,
+            )
 
     def _begin(self, program: int) -> None:
         """Counts calls, placed tools and granted time from 0 for a new program."""
         self._on_begin(self._peer is not None)
         self._told["program"], self._told["placed"], self._placed = program, 0, (0, 0)
+        self._shows, self._has_warned = 0, False
         if isinstance(self._bridge.clock, GrantedClock):
             self._bridge.clock.begin()
 
@@ -312,6 +340,7 @@ class Endpoint:
             told["placed"] = self._placed[0]
         told["grip"] = self._grip[0] if self._grip.size else np.nan
         if not len(rows):
+            told["credit"] = self._ratio * state["shown"]["tank"][0]
             pose = state["pose"][0]
             told["handle"][0] = [*pose["handle_position"], *pose["handle_quaternion"]]
             return

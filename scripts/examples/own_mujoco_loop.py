@@ -8,11 +8,12 @@ SCENE = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/>
   <body pos="0 0 .03" gravcomp="1"><freejoint/><geom size=".02" mass=".2"/><site name="tip"/></body>
 </worldbody></mujoco>"""
 model = mujoco.MjModel.from_xml_string(SCENE)
+own = {"scene_rate": 1.0 / model.opt.timestep}  # of the poses that are shown
 for uses_wrench in (True, False):
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     tip, velocity = data.site("tip").xpos, data.qvel[:3]
-    with hb.DeviceLoop("simulated", recording="own_loop.mcap", is_simulated=True) as device:
+    with hb.DeviceLoop("simulated", recording="own_loop.mcap", is_simulated=True, **own) as device:
         device.show(tip)
         for _ in range(1000):
             mujoco.mj_kinematics(model, data)  # or the pose is that of the last step's start
@@ -23,4 +24,5 @@ for uses_wrench in (True, False):
                 device.show(tip, velocity)
             mujoco.mj_step(model, data)
             device.advance(model.opt.timestep)  # not in real time
-    print(device.summary["verdict"], f"{device.summary['peak_force']:.2f} N at most")
+    is_certified = device.summary["is_certified"]
+    print(device.summary["verdict"], is_certified, f"{device.summary['peak_force']:.2f} N at most")
