@@ -43,15 +43,16 @@ def test_a_mesh_that_is_not_found_is_told_with_what_finds_it(
     is_mended: bool, call: Called, tmp_path: Path
 ) -> None:
     """The mesh is found where the scene has what the message says."""
-    scene_file(tmp_path / "parts", stl_bytes(), "m.stl")
+    scene_file(tmp_path / "parts" / "m", stl_bytes(), "m.stl")
     mesh = "<asset><mesh name='m' file='m.stl'/></asset>"
     part = "<mujoco><compiler meshdir='m'/><worldbody><geom type='mesh' mesh='m'/></worldbody>"
     (tmp_path / "parts" / "part.xml").write_text(f"{part}{mesh}</mujoco>")
     scene, robot = tmp_path / "own" / "scene.xml", tmp_path / "own" / "robot.urdf"
     scene.parent.mkdir()
-    later = "<compiler meshdir='../parts'/>" if is_mended else ""
+    later = "<compiler meshdir='../parts/m'/>" if is_mended else ""
     scene.write_text(f"<mujoco><include file='../parts/part.xml'/>{later}</mujoco>")
-    found = '<mujoco><compiler strippath="true" meshdir="../parts"/></mujoco>' if is_mended else ""
+    compiler = '<mujoco><compiler strippath="true" meshdir="../parts/m"/></mujoco>'
+    found = compiler if is_mended else ""
     mesh = '<geometry><mesh filename="package://arm/parts/m.stl"/></geometry>'
     link = f'<link name="base"><collision>{mesh}</collision></link>'
     robot.write_text(f'<robot name="arm">{found}{link}</robot>')

@@ -561,6 +561,7 @@ def test_a_tool_at_a_limit_is_implicit_and_lossless_before_and_after(stop: str) 
     assert is_free[480:].all()
 
 
+@pytest.mark.filterwarnings("ignore:.*the grip is held fast by a weld or connect")
 @pytest.mark.parametrize("hold", sorted(HOLDS))
 def test_a_tool_that_is_always_held_is_never_lossless(hold: str) -> None:
     assert not lossless_ticks(HOLDS[hold]).any()
