@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from firmware_build import COMPILER, FIRMWARE
+from board_attack import FLAGS, built_loop, gained
+from firmware_build import COMPILER
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
@@ -38,10 +39,8 @@ from hapticbridge.kernel.tick import posted_tick
 from hapticbridge.run.endpoint import posted_scene
 
 HERE = Path(__file__).parent
-FLAGS = ("-std=c++11", "-Wall", "-Wextra", "-Werror", "-O2", "-ffp-contract=off", f"-I{FIRMWARE}")
 
 PERIOD, STIFFNESS, DAMPING, LEVEL, CREDIT = 1e-4, 20e3, 0.5, 5.0, 0.01
-TICKS = 10_000
 
 pytestmark = pytest.mark.skipif(
     COMPILER is None, reason="neither g++ nor clang++ is here to compile the firmware with"
@@ -50,17 +49,7 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture(scope="module", name="library")
 def _library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
-    target = tmp_path_factory.mktemp("board") / "loop.so"
-    source = str(HERE / "board_loop_shim.cpp")
-    sources = [source, str(FIRMWARE / "hb_protocol.cpp")]
-    subprocess.run(
-        [str(COMPILER), *FLAGS, "-shared", "-fPIC", *sources, "-o", str(target)], check=True
-    )
-    library = ctypes.CDLL(str(target))
-    library.board_new.restype = ctypes.c_void_p
-    library.loop_new.restype, library.loop_new.argtypes = ctypes.c_void_p, [ctypes.c_float]
-    library.attack.restype = ctypes.c_double
-    return library
+    return built_loop(tmp_path_factory.mktemp("board"))
 
 
 def floats(values: Any) -> Any:
@@ -223,18 +212,6 @@ def test_each_period_is_that_of_the_kernel(library: ctypes.CDLL, seed: int) -> N
 
 
 # The account: a hand that may choose every motion, and a host that shows anything
-
-
-def gained(library: ctypes.CDLL, seed: int, **changes: float) -> float:
-    """Returns the most energy in J that a hand gets beyond the credit and the encoder's blur."""
-    rng = np.random.default_rng(seed)
-    period, b, share = 10 ** rng.uniform(-4.3, -3.0), rng.uniform(0.5, 5.0), rng.uniform(0.2, 1.0)
-    stiffness, level = share * 2.0 * b / period, 10 ** rng.uniform(0.0, 1.2)
-    credit, step = 10 ** rng.uniform(-3.0, -1.0), rng.choice([0.0, 0.0, 1e-5, 5e-5])
-    chosen = {"step": step, "damping_share": 1.0, "trust": 0.0} | changes
-    numbers = (period, stiffness, b - 0.5 * stiffness * period, level, credit, *chosen.values())
-    values = (ctypes.c_double * len(numbers))(*numbers)
-    return float(library.attack(ctypes.c_uint(seed), values, ctypes.c_long(TICKS))) - credit
 
 
 def test_no_hand_gets_more_than_the_credit(library: ctypes.CDLL) -> None:
