@@ -655,6 +655,17 @@ def test_a_tool_that_starts_in_a_height_field_is_told_to_start_outside(tmp_path:
     assert not any("start" in fault.sentence for fault in outside)
 
 
+def test_a_size_for_too_many_rows_is_told_to_go_for_the_memory(tmp_path: Path) -> None:
+    """The advice, followed, ends the finding; MuJoCo refuses the memory beside ``njmax``."""
+    text = """<mujoco><size {}/><option timestep="0.001" integrator="discrete" cone="elliptic"/>
+    <worldbody><body><freejoint/><geom size=".02" mass="0.1"/><site name="grip"/></body>
+    </worldbody></mujoco>"""
+    (fault,) = faults_in(tmp_path, text.format('njmax="5000" nconmax="5000"'))
+    assert '(memory="128M")' in fault.sentence
+    assert fault.change == "that memory in <size>, in place of njmax, nconmax and nstack"
+    assert not faults_in(tmp_path, text.format('memory="128M"'))
+
+
 def test_convex_pieces_open_the_hole_that_a_hull_fills(tmp_path: Path) -> None:
     """A square tube; the peg enters it once the advice is followed, and not before."""
 

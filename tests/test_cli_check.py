@@ -72,6 +72,23 @@ def test_check_says_where_a_urdf_takes_what_it_names(tmp_path: Path, call: Calle
     assert "URDF" not in out
 
 
+def test_check_says_where_a_urdf_that_does_not_compile_takes_its_inertia(
+    tmp_path: Path, call: Called
+) -> None:
+    """MuJoCo makes no MJCF of it, so the file itself has to be mended."""
+    text = LINK.format("")
+    broken = scene_file(tmp_path, text.replace('izz="1e-4"', 'izz="9e-4"'), "arm.urdf")
+    with pytest.raises(ValueError, match="inertia must satisfy"):
+        mujoco.MjSpec.from_file(str(broken)).to_xml()
+    code, out, _ = call("check", broken, "--grip", "tool")
+    assert code == 1
+    assert "write: the right inertia, or" in out
+    assert "mass and inertia into <inertial> in <link>" in out
+    code, out, _ = call("check", scene_file(tmp_path, text, "arm.urdf"), "--grip", "tool")
+    assert code == 0
+    assert "inertia, or" not in out
+
+
 def test_check_draws_a_motion_too_short_to_measure_growth(tmp_path: Path, call: Called) -> None:
     picture, motion = tmp_path / "check.png", tmp_path / "short.csv"
     motion.write_text("t,x,y,z\n0,0,0,0\n0.05,0.001,0,0\n")

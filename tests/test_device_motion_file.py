@@ -85,6 +85,22 @@ def test_messages_without_stamps_have_the_times_of_the_log(tmp_path: Path) -> No
     np.testing.assert_allclose(read_bag(file).table[:, 0], [0, 0.01, 0.02], atol=1e-12)
 
 
+@pytest.mark.parametrize("jump", [3 * 10**7, -3600 * 10**9])
+def test_a_log_that_jumps_leaves_messages_with_stamps_in_the_order_of_the_file(
+    tmp_path: Path, jump: int
+) -> None:
+    messages = [(at + (jump if i == 2 else 0), data) for i, (at, data) in enumerate(ramp())]
+    (file,) = bag(tmp_path / "walk", {"/hand": messages}).glob("*.mcap")
+    np.testing.assert_allclose(read_bag(file).table[:, 1], 1e-3 * np.arange(5))
+
+
+def test_a_clock_that_was_set_back_in_a_bag_is_told(tmp_path: Path) -> None:
+    messages = [*ramp(3), *ramp(3, start=10**18 - 3600 * 10**9)]
+    (file,) = bag(tmp_path / "walk", {"/hand": messages}).glob("*.mcap")
+    with pytest.raises(DeviceError, match=r"message 3 of /hand: time -3600 s after 0\.02 s"):
+        read_bag(file)
+
+
 def test_of_several_topics_one_is_named(tmp_path: Path) -> None:
     folder = bag(tmp_path / "two: a, b", {"/hand/left": ramp(), "/hand/right": ramp(9)})
     (file,) = folder.glob("*.mcap")

@@ -413,9 +413,9 @@ def test_a_trip_by_motors_that_took_more_than_they_gave_names_them(tmp_path: Pat
         (HandEnergy(net=4e-3, inputs=-3e-3), "moved mocap bodies, belts) took 3 mJ until then"),
         (HandEnergy(net=0.04, motors=0.01, inputs=0.01), "lower --stiffness"),
         (HandEnergy(net=0.0, motors=0.5 * INSTANT), "lower --stiffness"),
+        (HandEnergy(net=0.04, springs=0.05), "springs held 50 mJ at the start or after resets, by"),
+        (HandEnergy(net=0.04, springs=0.01), "lower --stiffness"),
     ],
 )
-def test_a_trip_names_the_port_that_did_at_least_half_of_the_net(
-    energy: HandEnergy, words: str
-) -> None:
+def test_a_trip_names_what_gave_at_least_half_of_the_net(energy: HandEnergy, words: str) -> None:
     assert words in Trip(TripCode.GAVE_ENERGY, 5).remedy(energy)

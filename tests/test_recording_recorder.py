@@ -98,6 +98,25 @@ def test_records_that_wait_at_the_close_are_drained(ring: Ring, tmp_path: Path) 
     assert read_recording(tmp_path / "run.mcap").ticks["tick"].tolist() == list(range(512))
 
 
+def test_a_file_holds_no_record_before_the_event_of_its_start(ring: Ring, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recorder = started(ring, path, META, ())
+    rows = numbered(0, 2048)  # eight chunks
+    produce(ring, recorder, rows[:1024])
+    limit = time.monotonic() + PATIENCE
+    while ring.pending():
+        assert time.monotonic() < limit
+        time.sleep(0.001)
+    recorder.event({"event": "start"}, 0)
+    produce(ring, recorder, rows[1024:])
+    recorder.close()
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 3])
+    cut = read_recording(path)
+    assert cut.is_cut
+    assert 0 < cut.ticks.size < rows.size
+    assert [event["event"] for event in cut.events] == ["start"]
+
+
 def test_events_beyond_the_pipe_wait_and_all_arrive(ring: Ring, tmp_path: Path) -> None:
     recorder = started(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()

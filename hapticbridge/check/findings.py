@@ -60,7 +60,7 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
                 "changed",
                 places.option("integrator"),
                 f"the scene runs with a change, {change}, because {change.treatment.why}",
-                APART if change.subject == "start" else _instead(change.treatment),
+                _OF_SUBJECT.get(change.subject) or _instead(change.treatment),
             )
     for name, concern in unmetered_work(case.model).items():
         place = places.with_attribute(name) or places.option(name)
@@ -70,6 +70,12 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
 APART = "a start (pos, or keyframe 'home') with parts apart, limits kept and constraints closed"
 """Change of a scene whose start a run moves. A tool in a height field may be moved far, out of its
 side or its base, and not to the place that was meant."""
+
+_OF_SUBJECT = {
+    "start": APART,
+    "memory": "that memory in <size>, in place of njmax, nconmax and nstack",
+}
+"""Ways to make a change in the file that is more than a new value."""
 
 
 def _instead(treatment: Treatment) -> str:

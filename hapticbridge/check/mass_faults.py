@@ -40,7 +40,7 @@ def mass_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             place,
             f"{place.element} moves, and MuJoCo refuses its inertia: it needs {what}; here it is "
             f"judged with {stand_in} instead",
-            mend if is_none else 'the right diaginertia, or balanceinertia="true" in <compiler>',
+            mend if is_none else 'the right inertia, or balanceinertia="true" in <compiler>',
         )
     yield from _default_densities(case)
     yield from _contact_ratios(case)

@@ -238,8 +238,9 @@ def print_cost(cost: Cost | None) -> None:
 
 
 _IN_URDF = (
-    "this is a URDF: in it <option> and <compiler> go into <mujoco> in <robot>, and MuJoCo reads "
-    "other attributes in MJCF alone, which mujoco.MjSpec.from_file(FILE).to_xml() makes of it"
+    "this is a URDF: in it <option> and <compiler> go into <mujoco> in <robot>, mass and inertia "
+    "into <inertial> in <link>, and MuJoCo reads other attributes in MJCF alone, which "
+    "mujoco.MjSpec.from_file(FILE).to_xml() makes of a URDF that compiles"
 )
 """Way to make the changes of a scene that is not written in MJCF."""
 

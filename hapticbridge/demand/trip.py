@@ -72,8 +72,9 @@ _REMEDIES = {
         "check the unit (m) and the times (s) of what it reports, and that no sample is late"
     ),
     TripCode.STRETCHED: (
-        "check the motion's unit (m) and speed, and the tool's mass (--no-tool-weight carries a "
-        "tool that falls or tips over); with another reach in mind raise --stretch-limit"
+        "check the motion's unit (m) and speed, the tool's mass (--no-tool-weight carries a tool "
+        "that falls or tips over), and springs or motors of the scene that push it beyond the "
+        "force limit; with another reach in mind raise --stretch-limit"
     ),
     TripCode.TWISTED: "turn more slowly, or raise --rotational-stiffness if the device bears it",
     TripCode.GAVE_ENERGY: "lower --stiffness",
@@ -90,6 +91,11 @@ _LIMIT_MOTORS = (
 _LIMIT_INPUTS = (
     "the scene's inputs (applied forces, moved mocap bodies, belts) {} until then: make them "
     "smaller or slower; if they are meant to push the hand, --energy-limit is what it may get"
+)
+_EASE_SPRINGS = (
+    "the coupling's springs held {} at the start or after resets, by what the tool bears: "
+    "--no-tool-weight carries its weight, a start without other loads leaves them slack, and "
+    "--energy-limit is what the hand may get"
 )
 _FIND_PUMP = (
     "the scene itself created {} until then: 'hapticbridge check SCENE' looks for what pumps, and "
@@ -193,4 +199,6 @@ class Trip:
                 return _LIMIT_MOTORS.format(work_words(energy.motors), most)
             if abs(energy.inputs) > least:
                 return _LIMIT_INPUTS.format(work_words(energy.inputs))
+            if energy.springs > least:  # a softer spring under the same load holds more
+                return _EASE_SPRINGS.format(format_energy(energy.springs))
         return _REMEDIES.get(self.code, "")

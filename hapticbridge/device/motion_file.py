@@ -238,7 +238,8 @@ def read_bag(path: Path, topic: str = "") -> Motion:
     """Reads the motion of a topic of poses from a bag of ROS 2 in MCAP.
 
     The times are those of the messages' stamps, or of the log where they have none. They are
-    counted from the first.
+    counted from the first. Messages are read in the order of the file: a log whose clock jumped,
+    or in which messages arrived unevenly, would put them into another one.
 
     Args:
         path: The file.
@@ -272,7 +273,7 @@ def read_bag(path: Path, topic: str = "") -> Motion:
     with path.open("rb") as file:
         try:
             reader = make_reader(file) if _index(file) else NonSeekingReader(file)
-            for _, _, message in reader.iter_messages(topics=[topic]):
+            for _, _, message in reader.iter_messages([topic], log_time_order=False):
                 stamp, pose = _pose_of(message.data)
                 stamps.append(stamp)
                 logged.append(message.log_time)

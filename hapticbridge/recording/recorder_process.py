@@ -270,14 +270,14 @@ class _Session:
     def _known(self, rows: NDArray[np.void]) -> NDArray[np.void]:
         """Returns the records whose events were written, too.
 
-        What another program has shown comes a little after the tick that took it over. Records that
-        are written without it could not be audited if the bridge dies.
+        The event of the start, and what another program has shown, come a little after their ticks.
+        Records that are written without them could not be audited if the bridge or machine dies.
         """
-        if not self._is_posted:
-            return rows
         if self._waiting.size:
             rows = np.concatenate([self._waiting, rows])
-        count = int(np.searchsorted(rows["scene_step"], self._posts, side="right"))
+        count = rows.size if self._has_begun else 0
+        if self._is_posted and count:
+            count = int(np.searchsorted(rows["scene_step"], self._posts, side="right"))
         self._waiting = rows[count:].copy()
         return rows[:count]
 
