@@ -301,8 +301,9 @@ class Check:
     """Find what is wrong with a scene, and what a tick of it costs.
 
     Leads the scene through its hand's motion and names every fault with the line to change. Exit
-    code 1 if a run would fail, 2 if the scene cannot be read, else 0. Notes, such as a mass that
-    MuJoCo chose or a change that a run makes by itself, do not affect the exit code.
+    code 1 if it finds what would let a run fail, 2 if the scene cannot be read, else 0. It does not
+    run the scene with its force, so a run may trip where nothing was found. Notes, such as a mass
+    that MuJoCo chose or a change that a run makes by itself, do not affect the exit code.
 
     Example:
         hapticbridge check my_tool.xml --lean --write lean.xml
