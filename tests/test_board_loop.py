@@ -414,7 +414,9 @@ def test_an_overtaken_or_damaged_tool_is_dropped(library: ctypes.CDLL) -> None:
     frame = bytearray(show_frames(22, ShownTool((0.01, 0.0, 0.0)), 50)[0])
     frame[9] ^= 1
     assert not board.send(bytes(frame))
-    assert not board.send(setting_frame(22, SETTING._replace(stiffness=math.inf)))
+    for name in ("stiffness", "damping", "level", "passing", "fade"):
+        for number in (math.inf, math.nan, -1e-3):
+            assert not board.send(setting_frame(22, SETTING._replace(**{name: number})))
     board.run(10)
     assert board.force == pytest.approx([1.0, 0.0, 0.0], rel=0.01)
 

@@ -231,6 +231,9 @@ bool HbDevice::take_order(const uint8_t frame[HB_FRAME_BYTES]) {
     order_.kind = HbOrder::SHOW;
   } else if (frame[2] == HB_KIND_SETTING) {
     if (!are_finite(frame + 8, 5)) return false;
+    for (int i = 0; i < 5; i++) {
+      if (get_float(frame + 8 + 4 * i) < 0.0f) return false;  // it would push the hand
+    }
     HbSetting& setting = order_.setting;
     setting.gains.stiffness = get_float(frame + 8);
     setting.gains.damping = get_float(frame + 12);
