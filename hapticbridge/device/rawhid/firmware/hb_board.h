@@ -1,6 +1,6 @@
 // A device whose board runs the loop, and follows force frames where a host sends them instead.
 //
-//   HbBoard board(sheet, 1e-4f);             // sheet.loop_rate and T are set from each other
+//   HbBoard board(sheet, 1e-4f);             // the sheet gets its loop_rate from T
 //   void interrupt() {                       // every T, by a timer
 //     float x[3] = {0, 0, 0}, f[3];
 //     read_position(x);                      // m
