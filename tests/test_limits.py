@@ -73,20 +73,23 @@ def test_too_small_files_are_one_sentence(tmp_path: Path, size: int) -> None:
     assert size > 5_000_000 or "'ulimit -f' allows" in done.stderr
 
 
-def other_user() -> tuple[str, ...]:
-    """Returns a command that runs another as a user whom the limit on processes binds."""
+def other_user(number: int) -> tuple[str, ...]:
+    """Returns a command that runs another as a user whom the limit on processes binds.
+
+    Each number is a user of its own: two tests at once would count each other's processes.
+    """
     if os.geteuid() != 0:
         return ()
     if shutil.which("setpriv") is None:
         pytest.skip("needs setpriv")
     rights = "+dac_override,+dac_read_search,+fowner"
-    return ("setpriv", "--reuid=65534", f"--inh-caps={rights}", f"--ambient-caps={rights}")
+    return ("setpriv", f"--reuid={60_000 + number}", f"--inh-caps={rights}", f"--ambient-caps={rights}")
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 10, 14, 4095])
 def test_too_few_processes_are_one_sentence(tmp_path: Path, count: int) -> None:
     record = tmp_path / "run.mcap"
-    done = run_under(resource.RLIMIT_NPROC, count, record, *other_user())
+    done = run_under(resource.RLIMIT_NPROC, count, record, *other_user(count))
     if not check_end(done, record):
         assert count < 30, done.stderr
         assert "'ulimit -u' allows" in done.stderr
