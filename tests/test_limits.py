@@ -83,7 +83,8 @@ def other_user(number: int) -> tuple[str, ...]:
     if shutil.which("setpriv") is None:
         pytest.skip("needs setpriv")
     rights = "+dac_override,+dac_read_search,+fowner"
-    return ("setpriv", f"--reuid={60_000 + number}", f"--inh-caps={rights}", f"--ambient-caps={rights}")
+    user = f"--reuid={60_000 + number}"
+    return ("setpriv", user, f"--inh-caps={rights}", f"--ambient-caps={rights}")
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 10, 14, 4095])
