@@ -231,11 +231,11 @@ def test_a_loop_that_was_killed_leaves_a_recording_to_audit(tmp_path: Path) -> N
         with DeviceLoop("simulated", recording=path) as device:
             pose = START.copy()
             with suppress(DeviceLost):
-                for step in range(150):
+                for step in range(400):
                     device.show(pose)
                     pose[0] += 1e-5
-                    time.sleep(0.003)
-                    if step == 100 + 7 * k:
+                    time.sleep(0.0005)
+                    if step == 300 + 7 * k:
                         assert device.pid is not None
                         os.kill(device.pid, signal.SIGKILL)
         end = time.monotonic() + 30.0
