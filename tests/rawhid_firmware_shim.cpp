@@ -126,7 +126,7 @@ int sketch_broken_sections() { return broken_sections; }
 #include "hb_protocol.h"
 
 static HbSheet sheet = {HB_X | HB_RZ, 990, NAN, 0.4f, NAN,  0.01f, 0.05f,
-                        1.5e-5f,      4,   0.1f, 2,   5e-4f, 0, "shim", 0};
+                        1.5e-5f,      4,   0.1f, 2,   5e-4f, 0, 0, "shim", 0};
 static const HbGrip grip = {0.05f, 2, NAN, 1e-5f, 8, 3, 0.03f};
 static HbDevice* device = 0;
 

@@ -46,7 +46,7 @@ def sheet_frames(sequence: int, numbers: protocol.Numbers, name: str) -> tuple[b
     """Returns both pages of a device's sheet; the name is truncated to 54 bytes in UTF-8."""
     text = name.encode()[:54].decode(errors="ignore").encode()
     return (
-        sealed(struct.pack("<BBBBHH12f6x", 0x48, 1, 0x44, 0, sequence, *numbers)),
+        sealed(struct.pack("<BBBBHH13f2x", 0x48, 1, 0x44, 0, sequence, *numbers)),
         sealed(struct.pack("<BBBBHH54s", 0x48, 1, 0x44, 1, sequence, 0, text)),
     )
 
@@ -54,7 +54,7 @@ def sheet_frames(sequence: int, numbers: protocol.Numbers, name: str) -> tuple[b
 MOTION = (0.01, -0.02, 0.03, 0.0, 0.0, 0.5, 0.1, 0.0, 0.0, 0.0, 0.0, -1.0)
 
 STATE = protocol.State(protocol.Status.ENABLED, 258, 1, 1_000_000, MOTION, 7)
-SHEET = (1, 990.0, NAN, 0.4, NAN, NAN, 0.05, 1.5e-5, 4.0, NAN, 2.0, 5e-4, 0.0)
+SHEET = (1, 990.0, NAN, 0.4, NAN, NAN, 0.05, 1.5e-5, 4.0, NAN, 2.0, 5e-4, 0.0, 0.0)
 UNKNOWN = protocol.Numbers(1, *[NAN] * 11)
 
 GRIP = protocol.GripNumbers(0.05, 2.0, NAN, 1e-5, 8.0, 3.0, 0.03)
@@ -153,7 +153,7 @@ def test_any_state_survives_a_frame(state: protocol.State) -> None:
 titles = st.text("a-é日🙂 7", max_size=80).map(str.strip)
 
 
-@given(st.integers(0, 63), st.lists(any_single, min_size=12, max_size=12), titles)
+@given(st.integers(0, 63), st.lists(any_single, min_size=13, max_size=13), titles)
 def test_any_sheet_survives_its_frames(axes: int, values: list[float], name: str) -> None:
     frames = sheet_frames(9, protocol.Numbers(axes, *values), name)
     numbers, title = map(protocol.decoded, frames)
@@ -320,7 +320,7 @@ def test_the_firmware_answers_with_its_sheet_once_per_question(shim: ctypes.CDLL
     assert isinstance(numbers, protocol.Numbers)
     assert numbers.axis_names == ("x", "rz")
     assert not numbers.has_grip
-    sheet = (990.0, None, 0.4, None, 0.01, 0.05, 1.5e-5, 4.0, 0.1, 2.0, 5e-4, 0.0)
+    sheet = (990.0, None, 0.4, None, 0.01, 0.05, 1.5e-5, 4.0, 0.1, 2.0, 5e-4, 0.0, 0.0)
     assert tuple(numbers.known().values()) == sheet
     shim.shim_receive(protocol.ask_frame(2, 1), 0)
     assert shim.shim_answer(frame)

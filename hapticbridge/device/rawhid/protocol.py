@@ -94,7 +94,7 @@ NUMBERS_PAGE, NAME_PAGE, GRIP_PAGE = 0, 1, 2
 _STATE = struct.Struct("<BBBBHHI12fH")
 _FORCE = struct.Struct("<BBBBHH7f26x")
 _GRIP = struct.Struct("<BBBBHH7f26x")
-_NUMBERS = struct.Struct("<BBBBHH12f6x")
+_NUMBERS = struct.Struct("<BBBBHH13f2x")
 _NAME = struct.Struct("<BBBBHH54s")
 _LOOP = struct.Struct("<BBBBHHI9fqfH")
 _REPORT = struct.Struct("<BBBBHH2q3I5f6x")
@@ -159,6 +159,7 @@ class Numbers(NamedTuple):
         delay: Delay of the device itself in s: from latching a pose to sending it, plus from
             receiving a force to the motors.
         loop_rate: Periods per second of a loop of its own; 0 without one.
+        loop_delay: Time in s in that loop from reading a position to its force.
     """
 
     axes: int
@@ -174,6 +175,7 @@ class Numbers(NamedTuple):
     speed_limit: float
     delay: float
     loop_rate: float = 0.0
+    loop_delay: float = 0.0
 
     def known(self) -> dict[str, float | None]:
         """Returns the numbers by name, None for NaN and infinity."""

@@ -62,6 +62,7 @@ HbSheet my_sheet() {
   sheet.torque_limit = NAN;  // it does not turn
   sheet.speed_limit = 2.0f;  // m/s, faster than a hand moves it
   sheet.delay = 1e-6f * CONTROL_PERIOD_US;
+  sheet.loop_delay = 10e-6f;  // s, from read_position() to write_force()
   sheet.name = "one-axis capstan paddle";
   return sheet;
 }

@@ -67,7 +67,7 @@ HbSheet my_sheet() {
   sheet.torque_limit = NAN;  // it does not turn
   sheet.speed_limit = 2.0f;  // m/s, faster than a hand moves it
   sheet.delay = 1e-6f * CONTROL_PERIOD_US;
-  sheet.loop_rate = 0.0f;  // no loop of its own
+  sheet.loop_rate = sheet.loop_delay = 0.0f;  // no loop of its own
   sheet.name = "Hapkit";
   return sheet;
 }

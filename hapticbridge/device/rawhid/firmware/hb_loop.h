@@ -134,11 +134,14 @@ class HbLoop {
     cap_ = hb_picojoules(held + setting.passing);
   }
 
-  // Ends the force at once, until a setting enables it again.
+  // Ends the force at once, until a setting enables it again, and forgets the scene: another one's
+  // work begins at 0, and nothing of the tank is left for it.
   void end() {
     setting_.is_enabled = false;
     share_ = 0.0f;
     memset(&gains_, 0, sizeof gains_);
+    report_.tank = scene_work_ = 0;
+    has_shown_ = false;
   }
 
   // Shows the tool. `placed`: it was put there, and the force begins anew.

@@ -178,7 +178,8 @@ bool HbDevice::answer(uint8_t frame[HB_FRAME_BYTES]) {
                              sheet_.torque_limit,
                              sheet_.speed_limit,
                              sheet_.delay,
-                             sheet_.loop_rate};
+                             sheet_.loop_rate,
+                             sheet_.loop_delay};
     for (size_t i = 0; i < sizeof numbers / sizeof *numbers; i++) {
       put_float(frame + 8 + 4 * i, numbers[i]);
     }

@@ -64,6 +64,7 @@ struct HbSheet {
   float speed_limit;         // m/s
   float delay;               // s, latch of the pose to sending it, plus reception to motors
   float loop_rate;           // Hz, periods of an HbLoop per second; 0 without one
+  float loop_delay;          // s, in that loop from reading a position to its force
   const char* name;          // UTF-8, at most HB_NAME_BYTES
   const HbGrip* grip;        // its grip axis; read only with HB_GRIP in axes
 };
