@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from hapticbridge.device.own_loop import SURFACES
 from hapticbridge.device.rawhid import protocol
 from hapticbridge.kernel import shown_tool
 
@@ -24,7 +25,7 @@ def header() -> str:
         "HB_OPTION_HAS_VELOCITY": protocol.HAS_VELOCITY,
         "HB_OPTION_IS_PLACED": protocol.IS_PLACED,
         "HB_OPTION_PLANE": protocol.PLANE,
-        "HB_PLANES": protocol.PLANES,
+        "HB_PLANES": SURFACES,
         "HB_TRIALS": shown_tool.TRIALS,
     }
     reals = {"HB_NEAR": shown_tool.NEAR, "HB_SLOWEST": shown_tool.SLOWEST}

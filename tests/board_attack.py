@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from firmware_build import COMPILER, FIRMWARE
@@ -27,6 +28,11 @@ def built_loop(folder: Path) -> ctypes.CDLL:
     library.loop_new.restype, library.loop_new.argtypes = ctypes.c_void_p, [ctypes.c_float]
     library.attack.restype = ctypes.c_double
     return library
+
+
+def floats(values: Any) -> Any:
+    """Returns numbers as an argument of the library, in single precision."""
+    return np.asarray(values, np.float32).ctypes.data_as(ctypes.POINTER(ctypes.c_float))
 
 
 def gained(library: ctypes.CDLL, seed: int, **changes: float) -> float:

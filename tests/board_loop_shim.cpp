@@ -150,16 +150,24 @@ void wall(const double* numbers, int is_on_board, double* found) {
   found[2] = -x;
 }
 
-// A whole board of 10 kHz, which a host knows by its frames alone.
-HbBoard* board_new() {
+// A whole board, which a host knows by its frames alone. numbers: damping, friction, step, largest
+// force and speed, mass.
+HbBoard* board_new(int axes, float period, const float* numbers) {
   HbSheet sheet;
   memset(&sheet, 0, sizeof sheet);
-  sheet.axes = HB_X | HB_Y | HB_Z;
+  sheet.axes = (uint16_t)axes;
   sheet.rate = 1000.0f;
-  sheet.damping = 2.0f;
-  sheet.force_limit = sheet.speed_limit = 5.0f;
+  sheet.damping = numbers[0];
+  sheet.friction = numbers[1];
+  sheet.resolution = numbers[2];
+  sheet.force_limit = numbers[3];
+  sheet.speed_limit = numbers[4];
+  sheet.mass = numbers[5];
+  sheet.torque_limit = sheet.rotational_damping = sheet.rotational_inertia = NAN;
+  sheet.delay = period;
+  sheet.loop_delay = 1e-5f;
   sheet.name = "board";
-  return new HbBoard(sheet, 1e-4f);
+  return new HbBoard(sheet, period);
 }
 
 void board_delete(HbBoard* board) { delete board; }

@@ -13,18 +13,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from board_attack import FLAGS, built_loop, gained
+from board_attack import FLAGS, built_loop, floats, gained
 from firmware_build import COMPILER
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import method_named, prepare
-from hapticbridge.device.rawhid.protocol import (
-    PLANES,
+from hapticbridge.device.own_loop import (
+    SURFACES,
+    BoardSetting,
     LoopReport,
-    LoopSetting,
     LoopState,
     ShownTool,
+)
+from hapticbridge.device.rawhid.protocol import (
     Status,
     ask_frame,
     decoded,
@@ -50,10 +52,6 @@ pytestmark = pytest.mark.skipif(
 @pytest.fixture(scope="module", name="library")
 def _library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     return built_loop(tmp_path_factory.mktemp("board"))
-
-
-def floats(values: Any) -> Any:
-    return np.asarray(values, np.float32).ctypes.data_as(ctypes.POINTER(ctypes.c_float))
 
 
 class Loop:
@@ -87,7 +85,7 @@ class Loop:
 
     def show(self, position: Any, velocity: Any = None, **others: Any) -> None:
         """Shows the tool; ``surfaces`` are normals and gaps, ``work`` is W in J."""
-        numbers = np.zeros(6 + 4 * PLANES)
+        numbers = np.zeros(6 + 4 * SURFACES)
         surfaces = others.get("surfaces", ())
         numbers[:3], numbers[3:6] = position, 0.0 if velocity is None else velocity
         for k, (normal, gap) in enumerate(surfaces):
@@ -151,14 +149,14 @@ def kernel() -> BoundKernel:
 def shown_at_random(rng: np.random.Generator, hand: NDArray[np.float64]) -> NDArray[np.void]:
     """Returns a tool near the hand, in numbers of single precision."""
     post = np.zeros(1, POST_DTYPE)
-    count, has_velocity = int(rng.integers(PLANES + 1)), rng.random() < 0.5
-    normals = rng.standard_normal((PLANES, 3))
+    count, has_velocity = int(rng.integers(SURFACES + 1)), rng.random() < 0.5
+    normals = rng.standard_normal((SURFACES, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     post["pose"][0, :3], post["pose"][0, 3] = hand + 3e-5 * rng.standard_normal(3), 1.0
     post["has_velocity"], post["planes"] = has_velocity, count
     post["velocity"][0, :3] = has_velocity * 0.05 * rng.standard_normal(3)
-    post["normals"][0, : 3 * PLANES] = normals.ravel()
-    post["gaps"][0, :PLANES] = np.abs(1e-5 * rng.standard_normal(PLANES))
+    post["normals"][0, : 3 * SURFACES] = normals.ravel()
+    post["gaps"][0, :SURFACES] = np.abs(1e-5 * rng.standard_normal(SURFACES))
     for name in ("pose", "velocity", "normals", "gaps"):
         post[name] = post[name].astype(np.float32)
     return post
@@ -340,7 +338,8 @@ class Board:
     """A board in virtual time, whose handle is where ``position`` says."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
-        self._library, self._board = library, ctypes.c_void_p(library.board_new())
+        self._library, numbers = library, floats([2.0, 0.0, 0.0, 5.0, 5.0, 0.1])
+        self._board = ctypes.c_void_p(library.board_new(0b111, ctypes.c_float(PERIOD), numbers))
         self.position, self.force, self.now = np.zeros(3), np.zeros(3), 0
         self.status = 0
 
@@ -367,7 +366,7 @@ class Board:
         return decoded(frame.raw)
 
 
-SETTING = LoopSetting(STIFFNESS, DAMPING, LEVEL, 0.0, 10 * PERIOD, 1e-3)
+SETTING = BoardSetting(STIFFNESS, DAMPING, LEVEL, 0.0, 10 * PERIOD, 1e-3)
 WALL = (((1.0, 0.0, 0.0), 0.0), ((0.0, 1.0, 0.0), 2e-4), ((0.0, 0.0, 1.0), 0.5))
 
 

@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hapticbridge.device.base import AXES
+from hapticbridge.device.own_loop import BoardSetting, ShownTool
 from hapticbridge.device.rawhid import device as driver
 from hapticbridge.device.rawhid import protocol
 
@@ -406,10 +407,10 @@ def test_the_sketch_pushes_as_told_and_its_interrupt_lets_go(sketch: ctypes.CDLL
 
 
 def test_the_sketch_renders_a_wall_by_itself(sketch: ctypes.CDLL) -> None:
-    sketch.sketch_send(protocol.setting_frame(1, protocol.LoopSetting(5e3, 0.0, 2.0, 0.0, 0.01)))
+    sketch.sketch_send(protocol.setting_frame(1, BoardSetting(5e3, 0.0, 2.0, 0.0, 0.01)))
     wall = (((1.0, 0.0, 0.0), 0.0),)
     for sequence in range(2, 7):
-        tool = protocol.ShownTool((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, wall)
+        tool = ShownTool((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, wall)
         sketch.sketch_send(protocol.show_frames(sequence, tool, 50)[0])
         sketch.sketch_run(10_000, 1)
         sketch.sketch_turn(-10 * (sequence > 3))

@@ -127,7 +127,8 @@ def load_machine_code(name: str, contact: str, kind: str = "") -> None:
             slow.simulate(sample, flags, nothing, flags, rows)
             slow.close()
         else:
-            by_hand = sample[:, None], flags[:, None], nothing, kernel.row, rows[:, None]
+            recorded = flags[:, None], nothing, rows["wrench_on_device"][:, None].copy()
+            by_hand = sample[:, None], recorded, kernel.row, rows[:, None]
             simulate_recorded(kernel.state, *by_hand)
         kernel.release()
     finally:

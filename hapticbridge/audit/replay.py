@@ -205,13 +205,13 @@ class Resimulator:
         samples["buttons"] = ticks["buttons"]
         outside = ticks["flags"] & int(TickFlag.STALE_SAMPLE)
         # a view of a record is read-only, for which no machine code is on disk
-        scene_steps = ticks["scene_step"].copy()
+        scene_steps, reported = ticks["scene_step"].copy(), ticks["wrench_on_device"].copy()
         elapsed = self._elapsed(ticks if self.hands is None else ticks[:, 0])
         rows = np.zeros(ticks.shape, TICK_DTYPE)
         own, done = self.hands or self.binding, 0
         by_hand = len(ticks), own.state.size
         each, found = samples.reshape(by_hand), rows.reshape(by_hand)
-        flags = outside.reshape(by_hand)
+        flags, reported = outside.reshape(by_hand), reported.reshape(*by_hand, 6)
         while done < len(ticks) and not self.is_over:
             end = len(ticks)
             if self._changes:
@@ -221,9 +221,8 @@ class Resimulator:
                 inputs = samples[part], outside[part], elapsed[part]
                 count = self._slow.simulate(*inputs, scene_steps[part], rows[part])
             else:
-                count = simulate_recorded(
-                    own.state, each[part], flags[part], elapsed[part], own.row, found[part]
-                )
+                recorded = flags[part], elapsed[part], reported[part]
+                count = simulate_recorded(own.state, each[part], recorded, own.row, found[part])
             self.is_over = count < end - done
             done += count
             if self._changes and done == end < len(ticks):

@@ -15,6 +15,7 @@ from hapticbridge.demand.loop_setting import (
     LoopSetting,
     assumed_lag,
     device_period,
+    pulling_loop,
     required_damping,
 )
 from hapticbridge.demand.methods import Method, default_method
@@ -71,7 +72,8 @@ def default_coupling(
     one with the largest K (``theory.bounds.stiffest_late_coupling``), for the ``assumed_lag``. If
     several evaluations per tick need more, or friction does not hold the encoder's steps, K and B'
     are lowered together; both conditions are linear in both. Without any friction no coupling is
-    free of swings by steps, so damping alone decides, and the condition says so.
+    free of swings by steps, so damping alone decides, and the condition says so. A loop of the
+    device's own gets a spring alone: B'Δ/T would take the friction that the steps need.
 
     Args:
         info: The device; unknown damping is replaced as in ``assumed_damping``.
@@ -93,8 +95,12 @@ def default_coupling(
     coupling = stiffest_coupling(damping, rotational, period)
     checked_substeps(law_evaluations, CouplingError)
     method = default_method(law_evaluations) if method is None else method
-    lag = assumed_lag(info, period)
-    if lag != IN_TIME:
+    own, own_period = pulling_loop(info, period)
+    lag = assumed_lag(own, own_period)
+    if info.loop_period is not None:
+        needed = required_damping(Coupling(1.0, 0.0, 0.0, 0.0), own_period, lag=lag)
+        coupling = replace(coupling, stiffness=NEEDED_SHARE * damping / needed, damping=0.0)
+    elif lag != IN_TIME:
         linear = stiffest_late_coupling(damping, period, lag.delay, lag.ticks_per_sample)
         coupling = replace(coupling, stiffness=linear[0], damping=linear[1])
         if info.turns:
@@ -103,13 +109,15 @@ def default_coupling(
                 coupling, rotational_stiffness=turned[0], rotational_damping=turned[1]
             )
     shrink = turn = 1.0
-    if law_evaluations > 1:
+    if law_evaluations > 1 and info.loop_period is None:
         needed = required_damping(coupling, period, law_evaluations, lag=lag)
         shrink = min(1.0, NEEDED_SHARE * damping / needed)
         felt = lag if info.turns else IN_TIME
         needed = required_damping(coupling, period, law_evaluations, "rotation", felt)
         turn = min(1.0, NEEDED_SHARE * rotational / needed)
-    loop = LoopSetting(info=info, law=coupling, period=period, scale=scale, force_scale=force_scale)
+    loop = LoopSetting(
+        info=own, law=coupling, period=own_period, scale=scale, force_scale=force_scale
+    )
     steps = StepCondition.of(loop)
     if steps is not None and steps.available and steps.needed:
         shrink = min(shrink, NEEDED_SHARE * steps.available / steps.needed)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hapticbridge.arguments import check_fields, option, unit_of
 from hapticbridge.clock import Clock, RealClock, SimulatedClock
 from hapticbridge.demand.certificate import assumed_damping
-from hapticbridge.demand.loop_setting import IN_TIME, Lag
+from hapticbridge.demand.loop_setting import IN_TIME, Lag, pulling_loop
 from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.device.base import JUMP_MARGIN
 from hapticbridge.device.registry import is_driver
@@ -349,7 +349,7 @@ def guard_parameters_for(
         controller: One of ``CONTROLLERS``. None selects ``damper`` for a device with less damping
             than the coupling needs, else ``environment``. For a device with enough damping only the
             environment is watched: the combined account could trigger when a spring, wound beyond
-            the torque limit, unwinds.
+            the torque limit, unwinds. A device with a loop of its own takes no damping: off.
     """
     common = GuardParameters(
         fade_ticks=max(round(FADE / period), 1),
@@ -372,6 +372,8 @@ def guard_parameters_for(
     # a hand that moves about an axis without motor is not paid, so its damping counts for nothing
     credit = [0.0 if sensed else own for own, sensed in zip(credit, info.senses, strict=True)]
     is_borne = linear >= needed[0] and angular >= needed[1]
+    if info.loop_period is not None:
+        controller = "off"
     own = period if info.rate is None else max(1.0 / info.rate, period)
     return replace(
         common,
@@ -394,6 +396,6 @@ def guard_parameters_for(
         swing_energy=SWING_ENERGY,
         runaway_speed=RUNAWAY_SPEED,
         twist_damping=_twist_damping(info, period),
-        stated_delay=info.delay or 0.0,
+        stated_delay=pulling_loop(info, period)[0].delay or 0.0,
         delay_margin=DELAY_MARGINS[info.delay is not None],
     )

@@ -70,6 +70,8 @@ class Lag:
     def of(cls, info: DeviceInfo, period: float) -> Lag:
         """Returns that of a device on a loop of period T in s."""
         delay = (delay_ticks(info, period) or 0) * period
+        if info.loop_period == period:  # it reads no reply in a tick, so its delay is not rounded
+            delay = info.loop_delay
         return cls(whole_ticks(device_period(info, period), period), delay)
 
 
@@ -92,6 +94,18 @@ def assumed_lag(info: DeviceInfo, period: float) -> Lag:
     if info.delay is None or info.is_delay_measured or info.is_prescribed:
         return lag
     return replace(lag, delay=lag.delay + min(period, UNCONFIRMED))
+
+
+def pulling_loop(info: DeviceInfo, period: float) -> tuple[DeviceInfo, float]:
+    """Returns the device as the loop that pulls at it sees it, and the period of that loop in s.
+
+    That is the bridge's loop of ``period`` s, or one of the device's own, which reads the position
+    itself: the link does not delay it.
+    """
+    if info.loop_period is None:
+        return info, period
+    own = replace(info, rate=None, delay=info.loop_delay, is_delay_measured=True)
+    return own, info.loop_period
 
 
 # Device damping required by a coupling
@@ -213,13 +227,15 @@ class LoopSetting:
     @classmethod
     def of_run(cls, info: DeviceInfo, run: RunParameters, method: Method) -> LoopSetting:
         """Returns the loop of a run; a weld counts by its measured stiffness and damping."""
+        own, period = pulling_loop(info, run.period)
+        has_own = info.loop_period is not None
         return cls(
-            info=info,
+            info=own,
             law=run.effective or run.coupling,
-            period=run.period,
+            period=period,
             scale=run.scale,
             force_scale=run.force_scale,
-            law_evaluations=run.law_evaluations,
+            law_evaluations=1 if has_own else run.law_evaluations,
             method=method,
             timestep=run.timestep,
         )

@@ -203,6 +203,9 @@ class DeviceInfo:
             the stops. None if unknown.
         sensed: Further axes that it senses without a motor, such as those of a wrist; by default
             none. The hand does not feel what its motion about them does.
+        loop_period: Period in s of a loop of its own, in which it renders the coupling to a shown
+            tool (``device.own_loop``), > 0; None without one.
+        loop_delay: Time in s in that loop from reading a position to its force, >= 0.
         grip_axis: Data sheet of the grip between the fingers, with the one axis ``x``: how far it
             is closed in m. Its ``reach`` is its travel. None without one.
 
@@ -231,6 +234,8 @@ class DeviceInfo:
     reach: float | None = option(None, unit="m", least=0.0, is_open=True)
     buttons: int | None = option(None, least=0)
     sensed: tuple[str, ...] = ()
+    loop_period: float | None = option(None, unit="s", least=0.0, is_open=True)
+    loop_delay: float = option(0.0, unit="s", least=0.0)
     grip_axis: DeviceInfo | None = None
 
     def __post_init__(self) -> None:

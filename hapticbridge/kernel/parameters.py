@@ -281,6 +281,8 @@ class RunParameters(StepTimes):
         credit: Energy in J that a scene of another program may give to the hand beyond what the
             hand put in; 0 for a scene of the bridge.
         is_beside: True for a slower scene's own loop (``of_scene``).
+        loop_period: T_b in s of the device's own loop, which renders the coupling to the tool that
+            it is shown (``device.own_loop``); 0 for a device that applies the bridge's wrench.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -309,6 +311,7 @@ class RunParameters(StepTimes):
     scene_ticks: int = 0
     credit: float = option(0.0, unit="J", least=0.0)
     is_beside: bool = False
+    loop_period: float = option(0.0, unit="s", least=0.0)
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -411,6 +414,11 @@ class RunParameters(StepTimes):
     def law_evaluations(self) -> int:
         """Evaluations of the tool's wrench per tick."""
         return 1 if self.scene_ticks else self.properties.law_evaluations(self.substeps)
+
+    @property
+    def is_apart(self) -> bool:
+        """True if a loop of the device's own gives the wrench on it."""
+        return self.loop_period > 0.0
 
     @property
     def has_law(self) -> bool:

@@ -62,7 +62,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.kernel.codes import Part, State
 from hapticbridge.kernel.force_level import limited_wrench
-from hapticbridge.kernel.handle import grip_pose, note_tool
+from hapticbridge.kernel.handle import device_from_scene, grip_pose, note_tool
 from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import (
     energy_at_level,
@@ -168,7 +168,7 @@ def bind_shown(shown: Part, parameters: RunParameters) -> None:
     The energy ``passing`` while a result is under way is 2 (F v + F_r ω) T_s, at v = 1 m/s and
     ω = 10 rad/s.
     """
-    shown["is_beside"] = parameters.is_beside
+    shown["is_beside"] = parameters.is_beside or parameters.is_apart
     if not parameters.scene_ticks:
         return
     of_scene = parameters.of_scene
@@ -358,6 +358,61 @@ def _take_planes(s: State, scene: State) -> None:
         shown.gaps[place] = gap
         shown.speeds[place] = pushed / timestep
     shown.planes = count
+
+
+# To a loop of the device's own
+
+
+@compiled
+def shown_to_device(state: NDArray[np.void], lead: float, numbers: NDArray[np.float64]) -> int:
+    """Finds the tool as a device with a loop of its own is shown it, after a step.
+
+    Must run while the contacts of the step exist.
+
+    Args:
+        state: The bound state.
+        lead: Time in s by which the tool is foreseen: from the sample to its coming to the device.
+        numbers: Receives, in the device's frame, position in m and velocity in m/s, the work W that
+            the scene has taken in J at the hand, and per surface its normal and gap in m, the
+            nearest surfaces first.
+
+    Returns:
+        The number of surfaces.
+    """
+    s = state[0]
+    shown, pose, run = s.shown, s.pose, s.run
+    tool, turn = vector_of(pose.tool_position), quaternion_of(pose.tool_quaternion)
+    store_vector(shown.newest[0:3], tool)
+    store_quaternion(shown.newest[3:7], turn)
+    _take_planes(s, s)
+    ahead = scaled(lead / run.period, vector_of(s.loop.motion))
+    handle = vector_of(pose.handle_position)
+    stretch = scaled(1.0 / run.scale, add(subtract(tool, handle), ahead))
+    store_vector(
+        numbers[0:3], add(vector_of(pose.device_position), device_from_scene(run.axes, stretch))
+    )
+    speed = scaled(1.0 / (run.period * run.scale), vector_of(s.loop.motion))
+    store_vector(numbers[3:6], device_from_scene(run.axes, speed))
+    numbers[6] = run.force_scale / run.scale * s.energy.coupling_work
+    moved = add(subtract(tool, vector_of(shown.before)), ahead)
+    turned = rotation_between(quaternion_of(shown.before[3:7]), turn)
+    count = 0
+    for first in range(7, numbers.size - 3, 4):
+        nearest, least = -1, np.inf
+        for k in range(shown.planes):
+            normal = vector_of(shown.normals[3 * k : 3 * k + 3])
+            arm = vector_of(shown.arms[3 * k : 3 * k + 3])
+            gap = shown.gaps[k] + dot(normal, add(moved, cross(turned, arm)))
+            if gap < least:
+                nearest, least = k, gap
+        if nearest < 0:
+            break
+        normal = vector_of(shown.normals[3 * nearest : 3 * nearest + 3])
+        store_vector(numbers[first : first + 3], device_from_scene(run.axes, normal))
+        numbers[first + 3] = least / run.scale
+        shown.gaps[nearest] = np.inf
+        count += 1
+    return count
 
 
 # In every tick

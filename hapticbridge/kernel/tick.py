@@ -175,12 +175,14 @@ LOOP_DTYPE = np.dtype(
         ("wrench_on_tool", "<f8", 6),
         ("motion", "<f8", 6),
         ("wrench_on_device", "<f8", 6),
+        ("reported", "<f8", 6),
         ("unfelt", "<f8", 6),
     ]
 )
 """Sub-record ``loop``, written by this module alone: results that one stage of a tick hands to the
 next. ``external_flags`` is ``STALE_SAMPLE`` as the live loop or a recording has it, set
-before the tick; ``has_positions`` is 1 if MuJoCo's position stage has run since the step;
+before the tick, and so is ``reported``, the wrench that a device with a loop of its own says that
+it had at its sample; ``has_positions`` is 1 if MuJoCo's position stage has run since the step;
 ``motion`` is the tool's, in m and rad; ``unfelt`` is the wrench that axes without a motor would be
 sent; wrenches in N and N m, peaks since the start."""
 
@@ -213,6 +215,13 @@ def _device_motion(pose: Part, position: Vector, quaternion: Quaternion) -> tupl
 
 
 @compiled
+def _take_mean_wrench(loop: Part) -> None:
+    """Takes the mean of a device's own wrench over the last tick, by the trapezoidal rule."""
+    for i in range(6):
+        loop.wrench_on_device[i] = 0.5 * (loop.wrench_on_device[i] + loop.reported[i])
+
+
+@compiled
 def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
     """Checks a sample, observes the energy of the previous tick, and moves the handle.
 
@@ -222,6 +231,8 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
         ``OK``, or the reason to refuse the sample; nothing was changed then.
     """
     pose = s.pose
+    if s.run.is_apart:
+        _take_mean_wrench(s.loop)
     position = vector_of(sample.position)
     if not _is_pose(position, quaternion_of(sample.quaternion)):
         return BAD_SAMPLE
@@ -250,6 +261,7 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
     advance_lever(s, position, buttons, elapsed)
     max_stretch = max_twist = np.inf
     is_timed = s.run.has_law and s.guard.has_hand and s.loop.tick > s.guard.start_tick
+    is_timed = is_timed and not s.run.is_apart  # else nothing waits for a sample
     if is_timed:
         charge_lateness(s, interval, ticks)
         charge_lag(s, lever, ticks, moved, turned)
@@ -570,12 +582,16 @@ def send_wrench(s: State, row: State, contacts: int) -> int:
 
 @compiled
 def _render(s: State, force: Vector, torque: Vector) -> None:
-    """Turns the wrench on the tool into the wrench on the device.
+    """Turns the wrench on the tool into the wrench on the device, or takes what it reports.
 
     In this order: scale, axes with a motor, the lever, share of the passivity controller's
     damping what fits, and the energy limit at full speed.
     """
     run = s.run
+    if run.is_apart:
+        for i in range(6):
+            s.loop.wrench_on_device[i] = s.loop.reported[i]
+        return
     if not run.has_law:  # nothing limits the wrench on the tool, so the device alone is spared
         force, torque = limited_wrench(s, force, torque)
     force = scaled(-run.force_scale, device_from_scene(run.axes, force))
@@ -899,8 +915,7 @@ def simulate(
 def simulate_recorded(
     state: NDArray[np.void],
     samples: NDArray[np.void],
-    external_flags: NDArray[np.int64],
-    elapsed: NDArray[np.float64],
+    recorded: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]],
     row: NDArray[np.void],
     rows: NDArray[np.void],
 ) -> int:
@@ -909,17 +924,20 @@ def simulate_recorded(
     Args:
         state: The bound states.
         samples: Device samples by tick and hand, (n, m).
-        external_flags: ``STALE_SAMPLE`` as recorded, (n, m).
-        elapsed: Time between two samples in s, one per tick.
+        recorded: ``STALE_SAMPLE`` as recorded, (n, m); the time between two samples in s, one per
+            tick; and the wrench that a device with a loop of its own reported, (n, m, 6).
         row: The bound records.
         rows: Receives the records, (n, m).
 
     Returns:
         Count of completed ticks, as for ``simulate``.
     """
+    external_flags, elapsed, reported = recorded
     for k in range(samples.shape[0]):
         for i in range(state.size):
             set_external_flags(state[i].loop, external_flags[k, i])
+            for axis in range(6):
+                state[i].loop.reported[axis] = reported[k, i, axis]
         if not whole_tick(state, samples[k], row, elapsed[k]):
             return k
         for i in range(state.size):

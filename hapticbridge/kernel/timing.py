@@ -169,7 +169,7 @@ def keep_account(s: State, deadline_ns: int, read_ns: int, write_ns: int) -> Non
     t.delays += 1e-9 * (write_ns - read_ns)
     t.jitter += max(lateness - t.lateness, 0.0)
     t.lateness = lateness
-    if not s.run.has_law:
+    if not s.run.has_law or s.run.is_apart:
         return
     credit = created = 0.0
     if t.device_delay_ns > 0:

@@ -25,7 +25,6 @@ from hapticbridge.demand.certificate import condition_sentences
 from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.trip import Trip, TripCode
 from hapticbridge.device import Device
-from hapticbridge.device.base import checked_read, checked_write
 from hapticbridge.errors import (
     CommandError,
     DeviceError,
@@ -260,7 +259,7 @@ class Bridge:
         """Runs the ticks until the end; returns a trip, or None."""
         kernel, model, data = session.kernel, self.scene.model, self.scene.data
         wait, now, stops = self.clock.wait, self.clock.now, self._stop.waiting
-        read_device, write_device = checked_read(self.device), checked_write(self.device)
+        read_device, write_device = session.port
         state, row, sample, samples = kernel.state, kernel.row, kernel.sample, session.samples
         before, answer, finish = kernel.before, kernel.answer, kernel.finish
         step, first_half, second_half = kernel.step, kernel.first_half, kernel.second_half

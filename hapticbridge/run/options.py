@@ -29,7 +29,7 @@ from hapticbridge.demand.guard import (
     limits_for,
     refuse_simulated_time,
 )
-from hapticbridge.demand.loop_setting import LoopSetting
+from hapticbridge.demand.loop_setting import LoopSetting, pulling_loop
 from hapticbridge.demand.methods import (
     Contact,
     Method,
@@ -367,17 +367,28 @@ def _usual_coupling(
     method, period = options.rendering_method, period_of(options.loop_rate)
     scales = options.workspace.scales
     usual = default_coupling(info, period, *scales, evaluations, method)
-    if not scene_ticks:
+    if not scene_ticks and info.loop_period is None:
         return usual
-    scene_period = scene_ticks * period
+    foreseen = scene_period = max(scene_ticks, 1) * period
+    if info.loop_period is not None:  # half the age of what its tool is foreseen from
+        foreseen = 0.5 * (scene_period + (info.delay or 0.0))
     law = method.law_coupling(usual, period)
-    share = min(steady_stiffness(scene, info, scene_period, *scales) / law.stiffness, 1.0)
+    share = min(steady_stiffness(scene, info, foreseen, *scales) / law.stiffness, 1.0)
     turned = min(
         share * law.rotational_stiffness,
-        steady_rotational_stiffness(info, scene_period, *scales),
+        steady_rotational_stiffness(info, foreseen, *scales),
     )
     law = replace(law, stiffness=share * law.stiffness, rotational_stiffness=turned)
     return method.requested_coupling(law, scene_period / (options.substeps or 1))
+
+
+def _suits_own_loop(scene: Scene, method: Method) -> bool:
+    """Returns True if a device with a loop of its own renders the coupling itself.
+
+    It has the coupling's law, and one tool of the bridge's scene that it moves along lines.
+    """
+    is_one = not scene.has_several_hands and scene.joint < 0
+    return method.can_be_slow and is_one and scene.credit == 0.0
 
 
 def _refuse_buttons(options: BridgeOptions, info: DeviceInfo, *, is_recorded: bool) -> None:
@@ -469,12 +480,17 @@ class RunSetup(StepTimes):
             HapticBridgeError: Two of them exclude each other; the message names both.
         """
         method, period = options.rendering_method, period_of(options.loop_rate)
+        if not _suits_own_loop(scene, method):
+            info = replace(info, loop_period=None)
         substeps, ticks = options.substeps or 1, options.scene_ticks
         is_real_clock = clock.name == RealClock.name
         if options.scene_rate == AUTO and is_real_clock and method.can_be_slow:
             ticks = scene_ticks_for(substeps * busy_step_time(scene, method, period), period)
         _refuse_buttons(options, info, is_recorded=is_recorded)
         refuse_simulated_time(info, clock)
+        if info.loop_period is not None and ticks:  # it waits for no scene, so the run is as slow
+            period, ticks = ticks * period, 0
+            options = replace(options, rate=1.0 / period, scene_rate=1.0 / period)
         evaluations = 1 if ticks else method.law_evaluations(substeps)
         if isinstance(coupling, Coupling):
             requested = coupling
@@ -541,13 +557,14 @@ class RunSetup(StepTimes):
     def loop(self) -> LoopSetting:
         """The loop as the device condition sees it."""
         scale, force_scale = self.workspace.scales
+        info, period = pulling_loop(self.info, self.period)
         return LoopSetting(
-            info=self.info,
+            info=info,
             law=self.law,
-            period=self.period,
+            period=period,
             scale=scale,
             force_scale=force_scale,
-            law_evaluations=self.law_evaluations,
+            law_evaluations=1 if self.info.loop_period else self.law_evaluations,
             method=self.method,
             timestep=self.timestep,
         )
@@ -666,6 +683,7 @@ class RunSetup(StepTimes):
             device_damping=damping,
             device_rotational_damping=rotational_damping,
             guarding=self.guard,
+            loop_period=self.info.loop_period or 0.0,
         )
 
     def _loaded(self, parameters: RunParameters) -> RunParameters:

@@ -21,6 +21,7 @@ from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.jit import Program, examples, prepare
 from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.kernel.state import STATE_DTYPE
+from hapticbridge.kernel.shown_tool import shown_to_device
 from hapticbridge.kernel.tick import (
     after_step,
     answer_step,
@@ -34,13 +35,15 @@ from hapticbridge.kernel.tick import (
 def programs() -> list[Program]:
     """Returns the programs, first those with the most work for LLVM."""
     state, sample, row = (np.zeros(1, each) for each in (STATE_DTYPE, SAMPLE_DTYPE, TICK_DTYPE))
-    counts, numbers = np.zeros(1, np.int64), np.zeros(1)
+    counts = np.zeros(1, np.int64)
+    recorded = counts[None], np.zeros(1), np.zeros((1, 1, 6))
     return [
         Program(after_step, (state, row, 0)),
         Program(answer_step, (state, row, 0)),
         Program(finish_tick, (state, row, row, counts, 0, 0, 0, 0, 0, True)),
         Program(before_step, (state, sample, row, 0, 0.0)),
-        Program(simulate_recorded, (state, sample[None], counts[None], numbers, row, row[None])),
+        Program(shown_to_device, (state, 0.0, np.zeros(7))),
+        Program(simulate_recorded, (state, sample[None], recorded, row, row[None])),
         Program(between_halves, (state,)),
         Program(stretch_at, (state[0], sample)),
         Program(next_sample, (np.zeros(1, HAND_DTYPE), np.empty((0, 8)), sample)),

@@ -159,6 +159,11 @@ class UncompiledScene:
         return self if hand == 0 else replace(self, grip=self.other_grips[hand - 1])
 
     @property
+    def has_several_hands(self) -> bool:
+        """True if several hands hold it."""
+        return bool(self.other_grips)
+
+    @property
     def joint(self) -> int:
         """0 if the hand holds a joint, else −1."""
         return 0 if Grip.from_text(self.grip).is_joint else -1
@@ -208,6 +213,8 @@ def setups_of(meta: Mapping[str, str], scene: Scene | None = None) -> tuple[RunS
         raise RecordingError("metadata 'grip' and 'request' name different hands")
     stored = [parameters_of(each) for each in metas]
     ticks, [first, *others] = stored[0].scene_ticks, request.grasps
+    if stored[0].is_apart:  # then the whole run is as slow as its scene
+        ticks = round(stored[0].period * request.options.loop_rate)
     if scene is None:
         is_slow = ticks or request.options.scene_ticks
         if is_slow and not isinstance(first.coupling, Coupling):

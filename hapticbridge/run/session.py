@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import mujoco
 import numpy as np
@@ -33,6 +33,7 @@ from hapticbridge.demand.probe import Probed, ProbedHand, probe_devices
 from hapticbridge.demand.trip import BY_TRIP, Trip, TripCode
 from hapticbridge.device import Device
 from hapticbridge.device.base import checked_close, checked_read, checked_start, checked_write
+from hapticbridge.device.own_loop import LoopDevice
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.kernel.codes import OK, RING_FULL
 from hapticbridge.kernel.jit import direct
@@ -54,7 +55,7 @@ from hapticbridge.realtime import (
     warn_of_refusals,
     warn_of_slow_motion,
 )
-from hapticbridge.recording.format import SHOWN_EVENT
+from hapticbridge.recording.format import OWN_LOOP_EVENT, SHOWN_EVENT
 from hapticbridge.recording.recorder import RecordOutput, RecordStream
 from hapticbridge.recording.ring import Snapshot
 from hapticbridge.run.commands import CommandExecutor, CommandQueue, EventApplier
@@ -68,6 +69,7 @@ from hapticbridge.run.description import (
 )
 from hapticbridge.run.hands import DeviceGroup
 from hapticbridge.run.options import RunSetup
+from hapticbridge.run.own_loop import OwnLoop
 from hapticbridge.run.posted_scene import PostedScene
 from hapticbridge.run.request import RunRequest
 from hapticbridge.run.slow_scene import SlowScene
@@ -159,6 +161,18 @@ class ProbedPort:
     def write(self, wrench: NDArray[np.float64]) -> None:
         """Commands a wrench per hand, (n, 6)."""
         self._write(wrench if isinstance(self._device, DeviceGroup) else wrench[0])
+
+
+class Port(NamedTuple):
+    """Calls of a tick to the device.
+
+    Attributes:
+        read: Writes the newest sample and returns its flags.
+        write: Sends the wrench of the tick.
+    """
+
+    read: Callable[[NDArray[np.void]], int]
+    write: Callable[[NDArray[np.float64]], None]
 
 
 class TickKernel:
@@ -371,6 +385,13 @@ class Session:
             self.commands.warm_up()
         bounds = (self.kernel.hands or bound).hands
         parts = tuple(zip(bounds, self.hand_parameters, strict=True))
+        self._port = Port(checked_read(self.device), checked_write(self.device))
+        self._own_loop = None
+        if self.parameters.is_apart:
+            lead = self.device.info.delay or 0.0
+            device = cast(LoopDevice, self.device)
+            self._own_loop = own = OwnLoop(device, bound, self.parameters, lead)
+            self._port = Port(own.read, own.write)
         self._applier = EventApplier(parts, scene.data, setup.method, start, self.beside)
         fade_ticks = max(each.guard.fade_ticks for each in self._setups)
         self.executor = CommandExecutor(self.commands, self._applier, fade_ticks, self.event)
@@ -383,6 +404,11 @@ class Session:
     def slow(self) -> SlowScene | None:
         """Loop of a scene that is slower than the bridge's; None without one."""
         return self.beside if isinstance(self.beside, SlowScene) else None
+
+    @property
+    def port(self) -> Port:
+        """Port to the device: itself, or what shows the tool to a loop of its own."""
+        return self._port
 
     @property
     def posted(self) -> PostedScene | None:
@@ -486,6 +512,7 @@ class Session:
             self._is_begun = False
         is_failed = error is not None and self.last_trip is None
         self._note_shown()
+        self._note_own_loop()
         self.event(
             "stop",
             reason="error" if is_failed else self.stopped_by,
@@ -634,10 +661,16 @@ class Session:
             else:
                 self.beside.note_picture(publish)
         self.stream.look()
+        self._note_own_loop()
         if self.beside is not None:
             self._note_shown()
             self._look_after(self.beside)
         return self.tick + self._chore_ticks
+
+    def _note_own_loop(self) -> None:
+        """Records what a loop of the device's own has reported since the last call."""
+        if self._own_loop is not None and (notes := self._own_loop.take_notes()):
+            self.event(OWN_LOOP_EVENT, **notes)
 
     def _note_shown(self) -> None:
         """Records what another program has shown since the last call."""

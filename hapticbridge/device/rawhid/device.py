@@ -20,6 +20,7 @@ from hapticbridge.device.base import (
     released,
 )
 from hapticbridge.device.driver import Driver, Notify, UsbId
+from hapticbridge.device.own_loop import BoardSetting, LoopReport, LoopState, ShownTool
 from hapticbridge.device.rawhid.protocol import (
     DOCUMENT,
     GRIP_PAGE,
@@ -35,6 +36,8 @@ from hapticbridge.device.rawhid.protocol import (
     ask_frame,
     decoded,
     force_frame,
+    setting_frame,
+    show_frames,
     version_of,
 )
 from hapticbridge.device.transport.hid import HidApi, opened
@@ -76,7 +79,7 @@ POLLING = 1e-3
 """Polling interval of a full-speed device in s, in each direction."""
 
 _MUST_SAY, _GRIP_MUST_SAY = ("rate", "speed_limit"), ("force_limit", "speed_limit")
-_FIXED = ("axes", "rate", "delay", "loop_rate")
+_FIXED = ("axes", "rate", "delay", "loop_delay")
 CHANGES = tuple(name for name in Numbers._fields if name not in _FIXED)
 """Numbers of the data sheet that the user may replace."""
 GRIP_CHANGES = ("grip_mass", "grip_damping", "grip_force_limit")
@@ -158,7 +161,7 @@ def data_sheet(
     if missing := [field for field in must if known[field] is None]:
         raise DeviceError(f"{name} does not report its {missing[0]}, which is required")
     delay = known.pop("delay")
-    known.pop("loop_rate")
+    known |= _own_loop(known.pop("loop_rate"), known["loop_delay"], axes, has_grip=grip is not None)
     values: dict[str, Any] = {} if grip is None else grip.known() | of_grip
     if missing := [each for each in _GRIP_MUST_SAY if each in values and values[each] is None]:
         raise DeviceError(f"{name} does not report its grip's {missing[0]}, which is required")
@@ -176,6 +179,15 @@ def data_sheet(
         raise DeviceError(f"{name} reports an impossible data sheet: {error}") from None
 
 
+def _own_loop(
+    rate: float | None, delay: float | None, axes: tuple[str, ...], *, has_grip: bool
+) -> dict[str, float | None]:
+    """Returns period and delay of a board's own loop, which moves a handle along lines alone."""
+    if not rate or has_grip or not set(axes) <= set(AXES[:3]):
+        return {"loop_period": None, "loop_delay": 0.0}
+    return {"loop_period": 1.0 / rate, "loop_delay": delay or 0.0}
+
+
 # State frames of a raw HID device
 
 _HALF_A_TURN = 0x80000000
@@ -190,6 +202,7 @@ class StateStream:
 
     Attributes:
         newest: Newest state; None before the first.
+        report: Newest counters of the device's own loop; None before the first.
         lost: Number of missing state frames, by their sequence.
         damaged: Number of reports that were not valid frames.
         repeated: Number of state frames that came twice.
@@ -197,7 +210,8 @@ class StateStream:
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self.newest: State | None = None
+        self.newest: State | LoopState | None = None
+        self.report: LoopReport | None = None
         self.lost = self.damaged = self.repeated = 0
 
     def takes(self, report: bytes) -> bool:
@@ -207,7 +221,10 @@ class StateStream:
             DeviceError: The device has restarted, or a number is not finite.
         """
         state = decoded(report)
-        if not isinstance(state, State):
+        if isinstance(state, LoopReport):
+            self.report = state
+            return False
+        if not isinstance(state, State | LoopState):
             self.damaged += state is None
             return False
         last, self.newest = self.newest, state
@@ -361,6 +378,35 @@ class RawHidDevice:
             self._send(force_frame(self._next(), NO_WRENCH, 1, is_enabled=False))
 
     @property
+    def loop_state(self) -> LoopState | None:
+        """Newest state of its own loop; None while it follows ``write``."""
+        state = self.states.newest
+        return state if isinstance(state, LoopState) else None
+
+    @property
+    def loop_report(self) -> LoopReport | None:
+        """Newest counters of its own loop; None before the first."""
+        return self.states.report
+
+    def set_loop(self, setting: BoardSetting) -> None:
+        """Sets the coupling that its own loop renders (``device.own_loop``)."""
+        self._send(setting_frame(self._next(), setting))
+
+    def show(self, shown: ShownTool) -> int:
+        """Shows the tool to its own loop, whose force fades after the watchdog's time without one.
+
+        Returns the sequence that the loop's state has as its echo.
+
+        Raises:
+            DeviceError: The loop hung and the guardian ended the force.
+        """
+        if self.last_word is not None:
+            self.last_word.beat(has_force=shown.is_enabled)
+        for frame in show_frames(self._next(), shown, self._watchdog_ms):
+            self._send(frame)
+        return self._sequence
+
+    @property
     def velocity(self) -> NDArray[np.float64]:
         """Last reported velocity in m/s and angular velocity in rad/s, shape (6,); initially 0."""
         state = self.states.newest
@@ -376,7 +422,7 @@ class RawHidDevice:
         state = self.states.newest
         return 0 if state is None else (self._sequence - state.echo) & 0xFFFF
 
-    def _refuse_fault(self, state: State) -> None:
+    def _refuse_fault(self, state: State | LoopState) -> None:
         if state.status & (Status.FAULT | Status.NOT_READY):
             what = "a fault of its own" if state.status & Status.FAULT else "that its pose was lost"
             raise DeviceError(
@@ -384,7 +430,7 @@ class RawHidDevice:
                 "restart and home it"
             )
 
-    def _fill(self, state: State) -> None:
+    def _fill(self, state: State | LoopState) -> None:
         """Converts a state into a sample; axes that the device lacks do not move."""
         pose = self._mask * state.numbers[:6]
         sample = self._sample[0]

@@ -13,6 +13,7 @@ import numpy as np
 
 from hapticbridge.device.base import AXES
 from hapticbridge.device.driver import printable
+from hapticbridge.device.own_loop import SURFACES, BoardSetting, LoopReport, LoopState, ShownTool
 
 DOCUMENT = Path(__file__).parents[1] / "rawhid.md"
 """Description of the protocol in this installation; the firmware is beside this module."""
@@ -84,9 +85,6 @@ ENABLE = 1
 HAS_VELOCITY, IS_PLACED, PLANE = 2, 4, 16
 """Byte 3 of a shown tool: its velocity is known, it was put there, and the factor of the number of
 surfaces."""
-
-PLANES = 3
-"""Surfaces near the tool that a loop on the board takes with a pose."""
 
 NUMBERS_PAGE, NAME_PAGE, GRIP_PAGE = 0, 1, 2
 """Pages of the sheet, byte 3 of a frame that requests or holds one."""
@@ -220,96 +218,6 @@ class GripNumbers(NamedTuple):
         return _known(self._asdict())
 
 
-class LoopState(NamedTuple):
-    """State of the device while its own loop follows a shown tool.
-
-    Attributes:
-        status, sequence, buttons, time_us, echo: As of ``State``; the echo is that of the newest
-            shown tool.
-        position, velocity, force: Handle in m and m/s and the force on it in N, in the device's
-            frame.
-        passed: Σ P, what the coupling has given to the shown tool, in J.
-        tank: D, what the shown tool may still give, in J.
-    """
-
-    status: int
-    sequence: int
-    buttons: int
-    time_us: int
-    position: tuple[float, ...]
-    velocity: tuple[float, ...]
-    force: tuple[float, ...]
-    passed: float
-    tank: float
-    echo: int
-
-
-class LoopReport(NamedTuple):
-    """Counters of the device's own loop.
-
-    Attributes:
-        sequence: That of the newest state.
-        changes: Σ |w_k − w_{k−1}| over periods and axes in N.
-        work: W of the newest shown tool in J.
-        held_back: Periods in which the tank was too low for the tool's motion.
-        ticks: Periods so far.
-        missed: Periods that the timer has missed.
-        share: Share of the gains in force, 0 to 1.
-        temperature: Temperature of the motors in °C; NaN if unknown.
-        tool: Position of the shown tool in m.
-    """
-
-    sequence: int
-    changes: float
-    work: float
-    held_back: int
-    ticks: int
-    missed: int
-    share: float
-    temperature: float
-    tool: tuple[float, ...]
-
-
-class ShownTool(NamedTuple):
-    """Tool as it is shown to a loop on the board, in the device's frame.
-
-    Attributes:
-        position: Its position in m.
-        velocity: Its velocity in m/s; None if it is not known.
-        work: W, all that the scene has taken so far, in J.
-        surfaces: At most ``PLANES`` surfaces near it: normal and gap in m.
-        is_placed: True if it was put there, and the force begins anew.
-        is_enabled: False ends the force.
-    """
-
-    position: tuple[float, ...]
-    velocity: tuple[float, ...] | None = None
-    work: float = 0.0
-    surfaces: tuple[tuple[tuple[float, ...], float], ...] = ()
-    is_placed: bool = False
-    is_enabled: bool = True
-
-
-class LoopSetting(NamedTuple):
-    """Coupling and times that a loop on the board has to render.
-
-    Attributes:
-        stiffness: K in N/m, in the device's frame.
-        damping: B' in N s/m.
-        level: Force level F in N.
-        passing: Energy in J that may be under way between two shown tools.
-        fade: Time in s in which the force rises and fades, and gains change.
-        credit: E in J, what the tool may give beyond what it got.
-    """
-
-    stiffness: float
-    damping: float
-    level: float
-    passing: float
-    fade: float
-    credit: float = 0.0
-
-
 def crc16(data: bytes) -> int:
     """Returns CRC-16/CCITT-FALSE: x^16 + x^12 + x^5 + 1, start 0xFFFF; 0x29B1 of "123456789"."""
     return crc_hqx(data, 0xFFFF)
@@ -341,7 +249,7 @@ def show_frames(sequence: int, shown: ShownTool, patience_ms: int) -> tuple[byte
         + PLANE * len(shown.surfaces)
     )
     planes = [number for normal, gap in shown.surfaces for number in (*normal, gap)]
-    planes += [0.0] * (4 * PLANES - len(planes))
+    planes += [0.0] * (4 * SURFACES - len(planes))
     velocity = shown.velocity or (0.0,) * 3
     head = MAGIC, VERSION, Kind.SHOW, option, sequence, patience_ms
     work = round(_PICOJOULES * shown.work)
@@ -352,7 +260,7 @@ def show_frames(sequence: int, shown: ShownTool, patience_ms: int) -> tuple[byte
     return _sealed(others), frame
 
 
-def setting_frame(sequence: int, setting: LoopSetting) -> bytes:
+def setting_frame(sequence: int, setting: BoardSetting) -> bytes:
     """Returns the frame with the gains of a loop on the board."""
     head = MAGIC, VERSION, Kind.SETTING, 0, sequence, 0
     credit = round(_PICOJOULES * setting.credit)

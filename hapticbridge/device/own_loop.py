@@ -1,0 +1,144 @@
+"""Loop of a device's own, on its board, that follows the tool which the host shows.
+
+    host, at 1 kHz or slower                      board, every T_b = 0.05 to 0.25 ms
+    SHOWN: y, its velocity, surfaces, W    ──▶    moves its tool toward y, as far as a tank pays
+                                                  reads h, computes K (h − y), pushes
+    the scene's coupling pulls at its tool ◀──    STATE: h, the force, Σ P, D
+
+The link is outside the board's loop, so its delay costs no stiffness: the condition on the device
+is b >= K (T_b/2 + t) + B', with t from reading a position to its force. ``rawhid.md`` has the
+board's side of it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, Protocol
+
+from hapticbridge.device.base import Device
+
+SURFACES = 3
+"""Surfaces near the tool that a loop on a board takes with a pose."""
+
+
+class LoopState(NamedTuple):
+    """State of the device while its own loop follows a shown tool.
+
+    Attributes:
+        status, sequence, buttons, time_us, echo: As of ``State``; the echo is that of the newest
+            shown tool.
+        position, velocity, force: Handle in m and m/s and the force on it in N, in the device's
+            frame.
+        passed: Σ P, what the coupling has given to the shown tool, in J.
+        tank: D, what the shown tool may still give, in J.
+    """
+
+    status: int
+    sequence: int
+    buttons: int
+    time_us: int
+    position: tuple[float, ...]
+    velocity: tuple[float, ...]
+    force: tuple[float, ...]
+    passed: float
+    tank: float
+    echo: int
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Position, rotation, velocity and angular velocity, as ``State`` has them."""
+        return (*self.position, *_NO_TURN, *self.velocity, *_NO_TURN)
+
+    @property
+    def is_finite(self) -> bool:
+        """True if all numbers are finite."""
+        return all(map(math.isfinite, (*self.numbers, *self.force, self.tank)))
+
+
+_NO_TURN = (0.0, 0.0, 0.0)
+
+
+class LoopReport(NamedTuple):
+    """Counters of the device's own loop.
+
+    Attributes:
+        sequence: That of the newest state.
+        changes: Σ |w_k − w_{k−1}| over periods and axes in N.
+        work: W of the newest shown tool in J.
+        held_back: Periods in which the tank was too low for the tool's motion.
+        ticks: Periods so far.
+        missed: Periods that the timer has missed.
+        share: Share of the gains in force, 0 to 1.
+        temperature: Temperature of the motors in °C; NaN if unknown.
+        tool: Position of the shown tool in m.
+    """
+
+    sequence: int
+    changes: float
+    work: float
+    held_back: int
+    ticks: int
+    missed: int
+    share: float
+    temperature: float
+    tool: tuple[float, ...]
+
+
+class ShownTool(NamedTuple):
+    """Tool as it is shown to a loop on the board, in the device's frame.
+
+    Attributes:
+        position: Its position in m.
+        velocity: Its velocity in m/s; None if it is not known.
+        work: W, all that the scene has taken so far, in J.
+        surfaces: At most ``SURFACES`` surfaces near it: normal and gap in m.
+        is_placed: True if it was put there, and the force begins anew.
+        is_enabled: False ends the force.
+    """
+
+    position: tuple[float, ...]
+    velocity: tuple[float, ...] | None = None
+    work: float = 0.0
+    surfaces: tuple[tuple[tuple[float, ...], float], ...] = ()
+    is_placed: bool = False
+    is_enabled: bool = True
+
+
+class BoardSetting(NamedTuple):
+    """Coupling and times that a loop on the board has to render.
+
+    Attributes:
+        stiffness: K in N/m, in the device's frame.
+        damping: B' in N s/m.
+        level: Force level F in N.
+        passing: Energy in J that may be under way between two shown tools.
+        fade: Time in s in which the force rises and fades, and gains change.
+        credit: E in J, what the tool may give beyond what it got.
+    """
+
+    stiffness: float
+    damping: float
+    level: float
+    passing: float
+    fade: float
+    credit: float = 0.0
+
+
+class LoopDevice(Device, Protocol):
+    """Device with a loop of its own, whose data sheet has ``loop_period``.
+
+    It follows ``write`` until the first ``show``, and again from the next ``write`` on.
+
+    Attributes:
+        loop_state: Its newest state in the loop; None before the first.
+        loop_report: Newest counters of its loop; None before the first.
+    """
+
+    loop_state: LoopState | None
+    loop_report: LoopReport | None
+
+    def set_loop(self, setting: BoardSetting) -> None:
+        """Sets the coupling that the loop renders; it moves there within ``fade``."""
+
+    def show(self, shown: ShownTool) -> int:
+        """Shows the tool; without another one the force fades. Returns what its echo will be."""

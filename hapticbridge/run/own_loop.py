@@ -1,0 +1,124 @@
+"""Port to a device with a loop of its own: the tool is shown to it, and it reports its force.
+
+    read:   the newest pose, and the wrench that the device had there (kernel: ``reported``)
+    write:  the tool of the step that just ended, its surfaces and W, what the scene has taken
+
+The device's loop renders the coupling at its own period; its account is that of
+``kernel.shown_tool``. The scene is pulled at by the same coupling in the bridge's tick, so W is
+exact. The force follows the lever: at 0 it fades on the device, and a lowered one softens it.
+"""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.device.own_loop import SURFACES, BoardSetting, LoopDevice, ShownTool
+from hapticbridge.kernel.jit import direct
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.shown_tool import FASTEST, shown_to_device
+from hapticbridge.kernel.state import BoundKernel
+
+REPORT_DTYPE = np.dtype([("tick", "<i8"), ("work", "<f8"), ("passed", "<f8"), ("tank", "<f8")])
+"""Report of a device's own loop at a sample: tick of the run, W of the newest tool that it had been
+shown, Σ P and D, all in J."""
+
+COUNTERS = ("changes", "held_back", "ticks", "missed")
+"""Counters of a device's own loop that are recorded (``device.own_loop.LoopReport``)."""
+
+_REMEMBERED = 256
+"""Shown tools whose work is kept until the device has answered them."""
+
+_REPEAT = 100
+"""Ticks after which the coupling is told again, for a link that may lose a message."""
+
+
+class OwnLoop:
+    """Port of a run to a device with a loop of its own, in the place of ``read`` and ``write``.
+
+    Args:
+        device: The device, started.
+        bound: The bound kernel of the run.
+        parameters: Parameters of the run.
+        lead: Time in s from a sample to the coming of the tool that answers it.
+    """
+
+    def __init__(
+        self, device: LoopDevice, bound: BoundKernel, parameters: RunParameters, lead: float
+    ) -> None:
+        self._device, self._state = device, bound.state
+        self._parameters = parameters
+        self._numbers = np.zeros(7 + 4 * SURFACES)
+        self._lead = lead
+        self._show = direct(shown_to_device, bound.state, lead, self._numbers)
+        loop, guard = bound.state["loop"], bound.state["guard"]
+        self._reported, self._tick = loop["reported"][0], loop["tick"]
+        self._lever, self._cap = guard["lever"], bound.state["watch"]["max_lever"]
+        self._coupling, self._level = bound.state["coupling"], bound.state["level"]["level"][0]
+        self._told: tuple[float, ...] = ()
+        self._told_tick = 0
+        self._works = np.zeros(_REMEMBERED)
+        self._reports: list[tuple[int, float, float, float]] = []
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        """Reads the newest pose and the wrench there, as ``Device.read``."""
+        flags = self._device.read(sample)
+        state = self._device.loop_state
+        if state is None:  # it follows no tool yet, and has no force
+            self._reported[:] = 0.0
+            return flags
+        self._reported[:3] = state.force
+        work = float(self._works[state.echo % _REMEMBERED])
+        self._reports.append((int(self._tick[0]), work, state.passed, state.tank))
+        return flags
+
+    def write(self, _wrench: NDArray[np.float64]) -> None:
+        """Shows the tool of the step that just ended, in the place of ``Device.write``."""
+        self._tell()
+        count = self._show(self._state, self._lead, self._numbers)
+        x, y, z, vx, vy, vz, work, *planes = self._numbers.tolist()
+        surfaces = tuple(
+            ((nx, ny, nz), gap)
+            for nx, ny, nz, gap in zip(*[iter(planes[: 4 * count])] * 4, strict=True)
+        )
+        shown = ShownTool(
+            (x, y, z), (vx, vy, vz), work, surfaces, is_enabled=bool(self._lever[0] > 0.0)
+        )
+        self._works[self._device.show(shown) % _REMEMBERED] = work
+
+    def _tell(self) -> None:
+        """Tells the device its coupling, when that changes and now and then."""
+        setting = self._setting()
+        tick = int(self._tick[0])
+        if setting != self._told or tick - self._told_tick >= _REPEAT:
+            self._told, self._told_tick = setting, tick
+            self._device.set_loop(setting)
+
+    def _setting(self) -> BoardSetting:
+        """Returns the coupling at the device; with a lever r it is r² as stiff."""
+        own, coupling = self._parameters, self._coupling
+        gains = coupling["tuning_goal"] if coupling["tuning_ticks"][0] else coupling
+        cap = float(self._cap[0])
+        ratio = own.scale * own.force_scale * cap * cap
+        force = cap * own.force_limit
+        is_risen = self._lever[0] >= cap
+        return BoardSetting(
+            stiffness=ratio * float(gains["stiffness"][0]),
+            damping=ratio * float(gains["damping"][0]),
+            level=force,
+            passing=2.0 * force * FASTEST * (own.period + self._lead),
+            fade=own.period * (own.guarding.fade_ticks if is_risen else max(own.ramp_ticks, 1)),
+        )
+
+    def take_notes(self) -> dict[str, Any] | None:
+        """Returns the details of an event on the reports since the last call, or None."""
+        if not self._reports:
+            return None
+        reports, self._reports = np.array(self._reports, REPORT_DTYPE), []
+        told: dict[str, Any] = {"reports": base64.b64encode(reports.tobytes()).decode()}
+        if (counters := self._device.loop_report) is not None:
+            told |= {name: getattr(counters, name) for name in COUNTERS}
+        return told
