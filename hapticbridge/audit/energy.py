@@ -260,7 +260,7 @@ class EnergyBalance:
         totals |= {"motors": ticks["actuator_work"], "external": ticks["external_work"]}
         totals |= _released(totals, before, stored - others_work, is_reset)
         ratio = parameters.force_scale / parameters.scale
-        net, unpaid = _hand_energies(ratio, totals, before, is_reset)
+        net, unpaid = _hand_energies(parameters, totals, before, is_reset)
         stretched = motion.stretch, motion.twist
         held = stored_in_springs(parameters, gains, stretched) - totals["start_springs"]
         # D_k = min(cap, D_{k-1} - E_k) is the lowest cap + Σ E so far, or 0, minus Σ E
@@ -305,7 +305,7 @@ def _device_excess(
 
 
 def _hand_energies(
-    ratio: float,
+    parameters: RunParameters,
     totals: dict[str, Array],
     before: dict[str, float],
     is_reset: NDArray[np.bool_],
@@ -313,14 +313,20 @@ def _hand_energies(
     """Returns ``EnergyBalance.net_energy`` and ``unpaid_energy`` of a hand, (n,) each in J.
 
     Both hold at the tick's sample, so the scene counts as it was after the last step. Storage that
-    a reset has put back in stays lost.
+    a reset has put back in stays lost. A device with a loop of its own may have what the scene
+    released at any time before.
     """
+    ratio = parameters.force_scale / parameters.scale
     stored, taken = (
         np.concatenate([[before[name]], totals[name][:-1]]) for name in ("released", "taken")
     )
     totals["forgotten"] = _summed(np.where(is_reset, stored, 0.0), before["forgotten"])
     net = totals["guarded_energy"] - ratio * (np.where(is_reset, 0.0, stored) + totals["forgotten"])
     released = np.maximum(totals["start_springs"] - taken, 0.0)
+    most = np.maximum(np.maximum.accumulate(released), before["most_released"])
+    totals["most_released"] = most
+    if parameters.is_apart:
+        released = most
     return net, totals["hand_energy"] - totals["unfelt_work"] - ratio * released
 
 
@@ -371,6 +377,8 @@ def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict
     rows = np.concatenate([block.state.row, ticks, block.following])
     sent = rows["wrench_on_device"][: len(ticks)].copy()
     sent[np.isin(ticks["tick"], events.resumed)] = 0.0
+    if parameters.is_apart:  # by the trapezoidal rule
+        sent = 0.5 * (sent + ticks["wrench_on_device"])
     moved, turned = _device_motion(rows, 0, len(ticks))
     late_moved, late_turned = _device_motion(rows, delay, len(ticks))
     work = np.sum(sent[:, :3] * moved, axis=1) + np.sum(sent[:, 3:] * turned, axis=1)

@@ -19,6 +19,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import conditions_of
 from hapticbridge.demand.loop_setting import LoopSetting, delay_ticks
 from hapticbridge.demand.methods import Method, RunCoupling
+from hapticbridge.demand.own_loop import EVENT as OWN_LOOP_EVENT
+from hapticbridge.demand.own_loop import OwnLoopAccount, OwnLoopTally
 from hapticbridge.demand.probe import EVENT as PROBE_EVENT
 from hapticbridge.demand.probe import MAX_DELAY, Direction
 from hapticbridge.device import AXES, DeviceInfo
@@ -45,6 +47,7 @@ class RunEvents:
         couplings: Couplings of the law (K and B') in order, the initial one first.
         added_delay: Delay in s that the probe found beyond the stated one.
         unanswered: Axes of which the probe could not tell the direction, by name.
+        reports: Events with what a loop of the device's own has reported.
     """
 
     parameters: RunParameters
@@ -53,6 +56,7 @@ class RunEvents:
     couplings: tuple[Coupling, ...]
     added_delay: float
     unanswered: str
+    reports: tuple[Mapping[str, Any], ...]
     _began: Array
     _switched: tuple[Array, NDArray[np.int64]]
     _homes: tuple[Array, Array]
@@ -64,9 +68,8 @@ class RunEvents:
         Raises:
             RecordingError: An event is damaged, or the metadata lack the tool's start.
         """
-        by_name: dict[str, list[Mapping[str, Any]]] = {
-            name: [] for name in ("resume", "reset", "coupling", "switch", PROBE_EVENT)
-        }
+        names = "resume", "reset", "coupling", "switch", PROBE_EVENT, OWN_LOOP_EVENT
+        by_name: dict[str, list[Mapping[str, Any]]] = {name: [] for name in names}
         for event in recording.events:
             if event.get("event") in by_name and concerns(event, parameters):
                 by_name[str(event["event"])].append(event)
@@ -84,6 +87,7 @@ class RunEvents:
             ),
             added_delay=max(map(_added_delay, by_name[PROBE_EVENT]), default=0.0),
             unanswered=", ".join(filter(None, map(_unanswered, by_name[PROBE_EVENT]))),
+            reports=tuple(by_name[OWN_LOOP_EVENT]),
             _began=ticks["coupling"],
             _switched=(
                 ticks["switch"],
@@ -173,6 +177,18 @@ class AuditedRun:
         return cls(info, method, parameters, RunEvents.from_recording(recording, parameters))
 
     @property
+    def own_loop(self) -> OwnLoopAccount | None:
+        """Account of a loop of the device's own; None without one.
+
+        Raises:
+            RecordingError: An event with its reports is damaged.
+        """
+        if not self.parameters.is_apart:
+            return None
+        tally = OwnLoopTally.begin(self.parameters.loop_period, self.info.resolution or 0.0)
+        return tally.of_events(self.events.reports)
+
+    @property
     def worst(self) -> RunParameters:
         """Run parameters with the most demanding coupling, per kind of axis.
 
@@ -201,7 +217,12 @@ class AuditedRun:
 
     @property
     def delay(self) -> int:
-        """Delay in ticks from a sample to the wrench that answers it; 0 if unknown."""
+        """Delay in ticks from a sample to the wrench that answers it; 0 if unknown.
+
+        It is 0 too for a wrench that the device reports with its sample.
+        """
+        if self.parameters.is_apart:
+            return 0
         return delay_ticks(self.info, self.parameters.period) or 0
 
 
@@ -282,6 +303,7 @@ SUMS = (
     "released",
     "taken",
     "forgotten",
+    "most_released",
     "sent_x",
     "sent_y",
     "sent_z",

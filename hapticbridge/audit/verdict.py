@@ -570,7 +570,8 @@ class JudgedDevice:
             silent_tick=timing.silent_tick,
             unanswered=run.events.unanswered,
         )
-        certification = certification_of(run.info, run.worst, run.method, times, energy)
+        account = run.own_loop
+        certification = certification_of(run.info, run.worst, run.method, times, energy, account)
         self.certification = certification
         if certification.kept.conditions:
             self.damping_margin = damping_margin(certification.kept.conditions)
@@ -653,6 +654,8 @@ def _compared_in_ticks(
     fault, duration = _check_records(hands, energies, timings)
     for hand, device, timing, tally in zip(hands, devices, timings, energies, strict=True):
         device.judge(hand, timing, tally.hand_energy)
+        if device.certification and (own_loop := device.certification.own_loop):
+            tally.excess = tally.excess or own_loop.first_excess
         fault = fault or first_contradiction(event_statements(hand.recording, timing))
     report = replace(
         report,
@@ -669,8 +672,10 @@ def _remarks(report: AuditReport, events: Sequence[Mapping[str, Any]]) -> tuple[
     """Returns what a reason adds on a recording without a fault, in clauses; some are empty."""
     certification = report.certification
     silence = certification and certification.kept.silence
+    own_loop = certification and certification.own_loop
     return (
         silence.sentence if silence else "",
+        f"the device's loop: {own_loop.words}" if own_loop else "",
         certification.reason if certification else "",
         _hand_words(report),
         unusual_end(report.trip, events),
@@ -765,6 +770,11 @@ def _unchecked(run: AuditedRun) -> str:
         return "the wrench comes from contacts: checked by re-simulation alone"
     if not method.has_law:
         return "no coupling law gives the wrench: checked by re-simulation alone"
+    if run.parameters.is_apart:
+        return (
+            "the force on the hand, and work and periods of the device's loop, are as the device "
+            "reported them: its board alone knows them"
+        )
     if run.parameters.law_evaluations > 1:
         return "the wrench is a mean over substeps: it and its work checked by re-simulation alone"
     return ""

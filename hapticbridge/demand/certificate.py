@@ -226,6 +226,7 @@ class DampingCondition:
         steps: Condition on the encoder's steps along this kind of axis; None without one.
         unconfirmed_delay: Largest constant delay in s that the damping bears, of the stated one and
             one tick more; None if a measurement confirms the delay.
+        loop_period: Period in s of a loop of the device's own; None for the bridge's.
         is_felt: False for axes that are sensed without a motor. The hand puts energy into the scene
             there without work of its own, so no damping bounds what it gets back along the axes
             with a motor (Barbagli & Salisbury 2003).
@@ -239,6 +240,7 @@ class DampingCondition:
     ticks_per_sample: int = 1
     steps: StepCondition | None = None
     unconfirmed_delay: float | None = None
+    loop_period: float | None = None
     is_felt: bool = True
 
     @property
@@ -299,7 +301,11 @@ class DampingCondition:
             text = f"{text} with one sample in {self.ticks_per_sample} ticks"
         if not self.is_damped:
             return f"{text}; {self.remedy}"
-        if self.delay is None:
+        if self.loop_period is not None:
+            period = format_si(self.loop_period, "s")
+            text = f"{text} in its own loop of {period}, with {format_si(self.delay or 0.0, 's')} "
+            text += "from a position to its force"
+        elif self.delay is None:
             text = f"{text}, if it answers without delay, which is unknown"
         elif self.delay:
             text = f"{text} with its delay of {format_si(self.delay, 's')}"
@@ -344,6 +350,7 @@ def _condition(loop: LoopSetting, axis: Axis, available: float | None) -> Dampin
         loop.lag.ticks_per_sample,
         _steps(loop) if axis == "translation" else None,
         unconfirmed,
+        loop.info.loop_period,
     )
 
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import Any
 
 from hapticbridge.demand.certificate import DampingCondition, is_run_certified, run_conditions
 from hapticbridge.demand.methods import Method
-from hapticbridge.demand.timekeeping import NOT_KEPT, RunTimes, Timekeeping
+from hapticbridge.demand.own_loop import OwnLoopAccount
+from hapticbridge.demand.timekeeping import NOT_KEPT, RunTimes, Timekeeping, silence_in
 from hapticbridge.device import DeviceInfo
 from hapticbridge.kernel.hand_energy import HandEnergy
-from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.parameters import UNGUARDED, RunParameters
 
 
 class Standing(StrEnum):
@@ -82,6 +83,7 @@ class Certification:
         is_borne: True if the device meets its conditions with every tick in time.
         law_evaluations: Evaluations of the law per tick.
         unanswered: Axes of which the probe could not tell the direction, by name.
+        own_loop: Account of a loop of the device's own; None without one.
     """
 
     standing: Standing
@@ -91,6 +93,7 @@ class Certification:
     is_borne: bool
     law_evaluations: int = 1
     unanswered: str = ""
+    own_loop: OwnLoopAccount | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Returns standing, time and energy by name, for JSON."""
@@ -141,7 +144,7 @@ class Certification:
         if self.kept.alarm is not None and self.standing is Standing.ALARM:
             return self.kept.alarm.words
         if self.standing is Standing.ENERGY:
-            return self.energy.fault
+            return (self.own_loop and self.own_loop.fault) or self.energy.fault
         if self.standing is Standing.TRIPPED:
             return "the guard stopped the run"
         failed = (each for each in self.conditions if each.holds is False)
@@ -158,6 +161,8 @@ class Certification:
 
     @property
     def _bound(self) -> str:
+        if any(each.loop_period for each in self.conditions):
+            return "K(T/2 + t) + B_law in its own loop"
         samples = max((each.ticks_per_sample for each in self.conditions), default=1)
         if samples > 1:
             return f"what one sample in {samples} ticks needs"
@@ -215,15 +220,21 @@ def certification_of(
     method: Method,
     times: RunTimes,
     energy: HandEnergy,
+    own_loop: OwnLoopAccount | None = None,
 ) -> Certification:
     """Judges the device of a hand by its conditions and by what the run was.
 
-    A run that was not as the conditions assume certifies no device that meets them.
+    A run that was not as the conditions assume certifies no device that meets them. ``own_loop`` is
+    what a loop of the device's own has reported, whose time then counts.
     """
     conditions = run_conditions(info, parameters, method)
-    kept = Timekeeping.from_times(
-        times, parameters, conditions if method.has_law else (), info.rate
-    )
+    judged = conditions if method.has_law else ()
+    if own_loop is None:
+        kept = Timekeeping.from_times(times, parameters, judged, info.rate)
+    else:
+        own = replace(parameters, period=parameters.loop_period, guarding=UNGUARDED)
+        kept = Timekeeping.from_times(own_loop.times(times), own, judged)
+        kept = replace(kept, silence=silence_in(times, parameters))
     verdict = is_run_certified(conditions, method)
     if info.is_prescribed:
         standing = Standing.NO_HAND
@@ -236,7 +247,7 @@ def certification_of(
         standing = Standing.DAMPING if is_weak else Standing.FRICTION
     elif verdict is None:
         standing = _open(conditions, method)
-    elif energy.fault:
+    elif energy.fault or (own_loop and own_loop.fault):
         standing = Standing.ENERGY
     else:
         standing = Standing.TRIPPED if times.has_tripped else Standing.CERTIFIED
@@ -248,6 +259,7 @@ def certification_of(
         verdict is True,
         parameters.law_evaluations,
         times.unanswered,
+        own_loop,
     )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hapticbridge.arguments import check_fields, option, unit_of
 from hapticbridge.clock import Clock, RealClock, SimulatedClock
 from hapticbridge.demand.certificate import assumed_damping
-from hapticbridge.demand.loop_setting import IN_TIME, Lag, pulling_loop
+from hapticbridge.demand.loop_setting import IN_TIME, Lag
 from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.device.base import JUMP_MARGIN
 from hapticbridge.device.registry import is_driver
@@ -396,6 +396,6 @@ def guard_parameters_for(
         swing_energy=SWING_ENERGY,
         runaway_speed=RUNAWAY_SPEED,
         twist_damping=_twist_damping(info, period),
-        stated_delay=pulling_loop(info, period)[0].delay or 0.0,
+        stated_delay=0.0 if info.loop_period else info.delay or 0.0,
         delay_margin=DELAY_MARGINS[info.delay is not None],
     )

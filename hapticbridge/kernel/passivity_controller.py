@@ -64,6 +64,7 @@ OBSERVER_DTYPE = np.dtype(
         ("springs", "<f8"),
         ("max_unpaid_energy", "<f8"),
         ("first_unpaid", "<i8"),
+        ("most_paid", "<f8"),
         ("created_energy", "<f8"),
         ("previous_created", "<f8"),
         ("previous_net_storage", "<f8"),
@@ -90,8 +91,9 @@ N s/m and N m s/rad, energies in J, velocities in m/s and rad/s. ``resolution`` 
 the last in N. ``max_guarded_energy`` is the largest ``guarded_energy`` so far. ``hand_energy`` is Σ
 (w·δp − b ‖δp‖²/t − W_u) with its largest value, ``springs`` the energy of the coupling's springs at
 the start and after each reset, ``max_unpaid_energy`` the largest unpaid energy
-(``hand_energy.HandEnergy``), ``first_unpaid`` the first tick in which it was more than
-``hand_energy.INSTANT``, −1 for none. ``released`` and ``pushed`` are R and m of
+(``hand_energy.HandEnergy``), ``most_paid`` the largest energy that scene and springs had released
+by then, for a device with a loop of its own, ``first_unpaid`` the first tick in which the unpaid
+energy was more than ``hand_energy.INSTANT``, −1 for none. ``released`` and ``pushed`` are R and m of
 ``observe_release``; ``input_work`` is the external work without that of resets. ``peak_*`` are the
 works of largest size, ``previous_*`` those and Σ E one tick before; ``work_at_reset`` is W_c at the
 last reset, ``is_reset`` 1 in the tick after it. ``reversals`` holds one bit per tick."""
@@ -270,7 +272,8 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
         pushes the hand, that energy counts as excess, and so does unfelt work.
         ``max_hand_energy``: largest Σ (w·δp − b ‖δp‖²/t − W_u), of the positions that were read.
         ``max_unpaid_energy``: largest Σ (w·δp − b ‖δp‖²/t − W_u) − q max(V_0 − W_c − P, 0), with
-        the springs' energy V_0, the coupling's work W_c and P = max(Σ E, 0).
+            the springs' energy V_0, the coupling's work W_c and P = max(Σ E, 0); for a device with
+            a loop of its own the largest of the latter part so far.
 
     Valid for a wrench that is held constant between ticks. A certified device keeps A <= 0.
 
@@ -321,6 +324,8 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     observer.max_hand_energy = max(observer.max_hand_energy, observer.hand_energy)
     released = observer.springs - max(energy.environment_energy, 0.0) - energy.coupling_work
     paid = (s.run.force_scale / s.run.scale) * max(released, 0.0)
+    if s.run.is_apart:  # its tank holds what the scene released, until the hand has got it
+        observer.most_paid = paid = max(observer.most_paid, paid)
     observer.max_unpaid_energy = max(observer.max_unpaid_energy, observer.hand_energy - paid)
     if observer.first_unpaid < 0 and observer.max_unpaid_energy > INSTANT:
         observer.first_unpaid = s.loop.tick

@@ -33,7 +33,6 @@ from hapticbridge.kernel.record import FORMAT, TICK_DTYPE, columns_of
 TICK_TOPIC = "/tick"
 EVENT_TOPIC = "/event"
 SHOWN_EVENT = "shown"  # the poses that another program has shown since the last one
-OWN_LOOP_EVENT = "own_loop"  # what a loop of the device's own has reported since the last one
 TICK_ENCODING = "cdr"
 EVENT_SCHEMA_NAME = "std_msgs/msg/String"
 EVENT_SCHEMA = b"string data # the event and what belongs to it, as JSON\n"

@@ -16,18 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.demand.own_loop import COUNTERS, REPORT_DTYPE, OwnLoopTally
 from hapticbridge.device.own_loop import SURFACES, BoardSetting, LoopDevice, ShownTool
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.shown_tool import FASTEST, shown_to_device
 from hapticbridge.kernel.state import BoundKernel
-
-REPORT_DTYPE = np.dtype([("tick", "<i8"), ("work", "<f8"), ("passed", "<f8"), ("tank", "<f8")])
-"""Report of a device's own loop at a sample: tick of the run, W of the newest tool that it had been
-shown, Σ P and D, all in J."""
-
-COUNTERS = ("changes", "held_back", "ticks", "missed")
-"""Counters of a device's own loop that are recorded (``device.own_loop.LoopReport``)."""
 
 _REMEMBERED = 256
 """Shown tools whose work is kept until the device has answered them."""
@@ -43,16 +37,16 @@ class OwnLoop:
         device: The device, started.
         bound: The bound kernel of the run.
         parameters: Parameters of the run.
-        lead: Time in s from a sample to the coming of the tool that answers it.
+
+    Attributes:
+        tally: Account of what the loop has reported.
     """
 
-    def __init__(
-        self, device: LoopDevice, bound: BoundKernel, parameters: RunParameters, lead: float
-    ) -> None:
+    def __init__(self, device: LoopDevice, bound: BoundKernel, parameters: RunParameters) -> None:
         self._device, self._state = device, bound.state
         self._parameters = parameters
         self._numbers = np.zeros(7 + 4 * SURFACES)
-        self._lead = lead
+        self._lead = lead = device.info.delay or 0.0  # to the coming of what answers a sample
         self._show = direct(shown_to_device, bound.state, lead, self._numbers)
         loop, guard = bound.state["loop"], bound.state["guard"]
         self._reported, self._tick = loop["reported"][0], loop["tick"]
@@ -62,6 +56,7 @@ class OwnLoop:
         self._told_tick = 0
         self._works = np.zeros(_REMEMBERED)
         self._reports: list[tuple[int, float, float, float]] = []
+        self.tally = OwnLoopTally.begin(parameters.loop_period, parameters.guarding.resolution)
 
     def read(self, sample: NDArray[np.void]) -> int:
         """Reads the newest pose and the wrench there, as ``Device.read``."""
@@ -118,7 +113,7 @@ class OwnLoop:
         if not self._reports:
             return None
         reports, self._reports = np.array(self._reports, REPORT_DTYPE), []
-        told: dict[str, Any] = {"reports": base64.b64encode(reports.tobytes()).decode()}
-        if (counters := self._device.loop_report) is not None:
-            told |= {name: getattr(counters, name) for name in COUNTERS}
-        return told
+        counters = self._device.loop_report
+        told = {} if counters is None else {name: getattr(counters, name) for name in COUNTERS}
+        self.tally.add(reports, told)
+        return {"reports": base64.b64encode(reports.tobytes()).decode(), **told}

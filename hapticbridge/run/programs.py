@@ -20,8 +20,8 @@ from hapticbridge.kernel.colliders import C_TYPES, box_box, flat_flat, round_fla
 from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.jit import Program, examples, prepare
 from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.kernel.state import STATE_DTYPE
 from hapticbridge.kernel.shown_tool import shown_to_device
+from hapticbridge.kernel.state import STATE_DTYPE
 from hapticbridge.kernel.tick import (
     after_step,
     answer_step,

@@ -28,6 +28,7 @@ from hapticbridge.demand.guard import (
     wait_until_still,
 )
 from hapticbridge.demand.methods import prepare, prepare_hands
+from hapticbridge.demand.own_loop import EVENT as OWN_LOOP_EVENT
 from hapticbridge.demand.probe import EVENT as PROBE_EVENT
 from hapticbridge.demand.probe import Probed, ProbedHand, probe_devices
 from hapticbridge.demand.trip import BY_TRIP, Trip, TripCode
@@ -55,7 +56,7 @@ from hapticbridge.realtime import (
     warn_of_refusals,
     warn_of_slow_motion,
 )
-from hapticbridge.recording.format import OWN_LOOP_EVENT, SHOWN_EVENT
+from hapticbridge.recording.format import SHOWN_EVENT
 from hapticbridge.recording.recorder import RecordOutput, RecordStream
 from hapticbridge.recording.ring import Snapshot
 from hapticbridge.run.commands import CommandExecutor, CommandQueue, EventApplier
@@ -385,13 +386,7 @@ class Session:
             self.commands.warm_up()
         bounds = (self.kernel.hands or bound).hands
         parts = tuple(zip(bounds, self.hand_parameters, strict=True))
-        self._port = Port(checked_read(self.device), checked_write(self.device))
-        self._own_loop = None
-        if self.parameters.is_apart:
-            lead = self.device.info.delay or 0.0
-            device = cast(LoopDevice, self.device)
-            self._own_loop = own = OwnLoop(device, bound, self.parameters, lead)
-            self._port = Port(own.read, own.write)
+        self._open_port(bound)
         self._applier = EventApplier(parts, scene.data, setup.method, start, self.beside)
         fade_ticks = max(each.guard.fade_ticks for each in self._setups)
         self.executor = CommandExecutor(self.commands, self._applier, fade_ticks, self.event)
@@ -399,6 +394,15 @@ class Session:
         if setup.mark:
             self.mark = MarkButton(setup.mark, sample, lambda: self.event("mark", by="button"))
         self._chore_ticks = max(round(self._chore_period / setup.period), 1)
+
+    def _open_port(self, bound: BoundKernel) -> None:
+        """Makes the port to the device, or to a loop of its own."""
+        self._port = Port(checked_read(self.device), checked_write(self.device))
+        self._own_loop: OwnLoop | None = None
+        if self.parameters.is_apart:
+            device = cast(LoopDevice, self.device)
+            self._own_loop = own = OwnLoop(device, bound, self.parameters)
+            self._port = Port(own.read, own.write)
 
     @property
     def slow(self) -> SlowScene | None:
@@ -712,6 +716,7 @@ class Session:
 
     def note_stop(self) -> None:
         """Takes the requests that ended the run; later ones end the next run."""
+        self._note_own_loop()
         by, signal = self.stop.take()
         if by:
             self.stopped_by, self.signal = by, signal
@@ -764,6 +769,7 @@ class Session:
             is_realtime=self.setup.is_realtime,
             start_potential=self._start_potential,
             trip=self.last_trip,
+            own_loop=None if self._own_loop is None else self._own_loop.tally.account,
         )
         hands = [
             Summary.from_state(

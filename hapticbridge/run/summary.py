@@ -23,6 +23,7 @@ from hapticbridge.demand.certification import (
 )
 from hapticbridge.demand.loop_setting import fresh_share
 from hapticbridge.demand.methods import Method, RunCoupling, default_method, method_named
+from hapticbridge.demand.own_loop import OwnLoopAccount
 from hapticbridge.demand.probe import Direction, Probed
 from hapticbridge.demand.timekeeping import RunTimes, Timekeeping
 from hapticbridge.demand.trip import Trip
@@ -156,6 +157,7 @@ class RunOutcome:
         start_potential: Potential energy in J before the first tick.
         trip: Stop by the guard; None without one.
         probed: Result of the probe of the hand's device; None without one.
+        own_loop: Account of a loop of the device's own; None without one.
     """
 
     ticks: int
@@ -168,6 +170,7 @@ class RunOutcome:
     start_potential: float
     trip: Trip | None = None
     probed: Probed | None = None
+    own_loop: OwnLoopAccount | None = None
 
     def added_delay(self, info: DeviceInfo, period: float) -> float:
         """Returns the delay in s that the probe found beyond the stated one."""
@@ -381,6 +384,8 @@ class Summary:
         yield "overruns", f"{self.overruns}{skipped}, records dropped {self.dropped}"
         if self.probe:
             yield "probe", self.probe
+        if own_loop := self.certification.own_loop:
+            yield "device's loop", own_loop.words
         if remark := self.timekeeping.remark:
             yield "time kept", remark
         if silence := self.timekeeping.silence:
@@ -482,7 +487,7 @@ class Summary:
         )
         peaks: dict[str, Any] = {name: float(state["loop"][name][0]) for name in _PEAKS}
         hand = HandEnergy() if info.is_prescribed else hand_energy(state, parameters)
-        certification = certification_of(info, parameters, method, times, hand)
+        certification = certification_of(info, parameters, method, times, hand, outcome.own_loop)
         return cls(
             ticks=outcome.ticks,
             duration=(outcome.ticks + outcome.skipped) * parameters.period,

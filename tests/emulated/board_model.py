@@ -1,4 +1,4 @@
-"""A home-made device whose board runs ``hb_loop``: its firmware, compiled, behind raw HID frames."""
+"""A home-made device whose board runs ``hb_loop``: its firmware, compiled, behind raw HID."""
 
 from __future__ import annotations
 

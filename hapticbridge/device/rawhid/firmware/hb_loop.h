@@ -140,7 +140,7 @@ class HbLoop {
     setting_.is_enabled = false;
     share_ = 0.0f;
     memset(&gains_, 0, sizeof gains_);
-    report_.tank = scene_work_ = 0;
+    report_.tank = report_.passed = scene_work_ = 0;
     has_shown_ = false;
   }
 
