@@ -93,10 +93,10 @@ the last in N. ``max_guarded_energy`` is the largest ``guarded_energy`` so far. 
 the start and after each reset, ``max_unpaid_energy`` the largest unpaid energy
 (``hand_energy.HandEnergy``), ``most_paid`` the largest energy that scene and springs had released
 by then, for a device with a loop of its own, ``first_unpaid`` the first tick in which the unpaid
-energy was more than ``hand_energy.INSTANT``, −1 for none. ``released`` and ``pushed`` are R and m of
-``observe_release``; ``input_work`` is the external work without that of resets. ``peak_*`` are the
-works of largest size, ``previous_*`` those and Σ E one tick before; ``work_at_reset`` is W_c at the
-last reset, ``is_reset`` 1 in the tick after it. ``reversals`` holds one bit per tick."""
+energy was more than ``hand_energy.INSTANT``, −1 for none. ``released`` and ``pushed`` are R and m
+of ``observe_release``; ``input_work`` is the external work without that of resets. ``peak_*`` are
+the works of largest size, ``previous_*`` those and Σ E one tick before; ``work_at_reset`` is W_c at
+the last reset, ``is_reset`` 1 in the tick after it. ``reversals`` holds one bit per tick."""
 
 
 def bind_observer(observer: Part, guarding: GuardParameters) -> None:

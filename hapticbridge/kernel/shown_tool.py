@@ -385,14 +385,14 @@ def shown_to_device(state: NDArray[np.void], lead: float, numbers: NDArray[np.fl
     store_vector(shown.newest[0:3], tool)
     store_quaternion(shown.newest[3:7], turn)
     _take_planes(s, s)
-    ahead = scaled(lead / run.period, vector_of(s.loop.motion))
+    velocity = scaled(1.0 / run.period, vector_of(s.loop.motion))
+    ahead = scaled(lead, velocity)
     handle = vector_of(pose.handle_position)
     stretch = scaled(1.0 / run.scale, add(subtract(tool, handle), ahead))
     store_vector(
         numbers[0:3], add(vector_of(pose.device_position), device_from_scene(run.axes, stretch))
     )
-    speed = scaled(1.0 / (run.period * run.scale), vector_of(s.loop.motion))
-    store_vector(numbers[3:6], device_from_scene(run.axes, speed))
+    store_vector(numbers[3:6], device_from_scene(run.axes, scaled(1.0 / run.scale, velocity)))
     numbers[6] = run.force_scale / run.scale * s.energy.coupling_work
     moved = add(subtract(tool, vector_of(shown.before)), ahead)
     turned = rotation_between(quaternion_of(shown.before[3:7]), turn)

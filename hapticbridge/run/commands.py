@@ -558,6 +558,11 @@ class EventApplier:
         self._hands, self._data, self._slow = tuple(hands), data, slow
         self._method, self._start = method, start
 
+    @property
+    def period(self) -> float:
+        """Time in s between two ticks, for all hands."""
+        return self._hands[0][1].period
+
     def apply(self, event: Mapping[str, Any]) -> None:
         """Applies an event of ``CHANGES`` before the tick that it names.
 
@@ -786,7 +791,7 @@ class CommandExecutor:
             limits = self._queue.limits[grip]
             requested = self.requested[grip] = limits.requested(command, self.requested[grip])
             law = asdict(limits.law(requested))
-            ticks = tuning_ticks(limits.loop.period)
+            ticks = tuning_ticks(self._applier.period)
             named = self._named(grip)
             self._apply({"event": "coupling", **law, "ticks": ticks, "by": by, **named})
         elif isinstance(command, Switch):

@@ -23,6 +23,9 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.shown_tool import FASTEST, shown_to_device
 from hapticbridge.kernel.state import BoundKernel
 
+AGILITY = 0.05
+"""Share of a new measurement of the delay that is taken over at once, without unit."""
+
 _REMEMBERED = 256
 """Shown tools whose work is kept until the device has answered them."""
 
@@ -54,7 +57,7 @@ class OwnLoop:
         self._coupling, self._level = bound.state["coupling"], bound.state["level"]["level"][0]
         self._told: tuple[float, ...] = ()
         self._told_tick = 0
-        self._works = np.zeros(_REMEMBERED)
+        self._works, self._sent = np.zeros(_REMEMBERED), np.full(_REMEMBERED, -1, np.int64)
         self._reports: list[tuple[int, float, float, float]] = []
         self.tally = OwnLoopTally.begin(parameters.loop_period, parameters.guarding.resolution)
 
@@ -66,8 +69,11 @@ class OwnLoop:
             self._reported[:] = 0.0
             return flags
         self._reported[:3] = state.force
-        work = float(self._works[state.echo % _REMEMBERED])
-        self._reports.append((int(self._tick[0]), work, state.passed, state.tank))
+        place, tick = state.echo % _REMEMBERED, int(self._tick[0])
+        self._reports.append((tick, float(self._works[place]), state.passed, state.tank))
+        if self._sent[place] >= 0 and not flags:
+            took = self._parameters.period * (tick - self._sent[place])
+            self._lead += AGILITY * (took - self._lead)
         return flags
 
     def write(self, _wrench: NDArray[np.float64]) -> None:
@@ -82,7 +88,8 @@ class OwnLoop:
         shown = ShownTool(
             (x, y, z), (vx, vy, vz), work, surfaces, is_enabled=bool(self._lever[0] > 0.0)
         )
-        self._works[self._device.show(shown) % _REMEMBERED] = work
+        place = self._device.show(shown) % _REMEMBERED
+        self._works[place], self._sent[place] = work, self._tick[0]
 
     def _tell(self) -> None:
         """Tells the device its coupling, when that changes and now and then."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from board_attack import floats
+from numpy.typing import NDArray
 
 from emulated.hid_device import HidDevice
 from emulated.rawhid_model import RawHid
@@ -44,6 +45,7 @@ class LoopBoard(HidDevice):
         force: Force on the handle in N, (3,).
         work: Energy in J that the motors have given the handle.
         burned: Energy in J that the stated damping has burned meanwhile.
+        skip_every: Number of periods of which one is missed; 0 for none.
     """
 
     vendor, product, serial = RawHid.vendor, RawHid.product, "7"
@@ -72,7 +74,7 @@ class LoopBoard(HidDevice):
         self._to_host: deque[tuple[float, bytes]] = deque()
         self._to_board: deque[tuple[float, bytes]] = deque()
         self.work = self.burned = 0.0
-        self.status = 0
+        self.status = self.skip_every = 0
 
     def advance(self, now: float) -> None:
         if self._start is None:
@@ -97,14 +99,16 @@ class LoopBoard(HidDevice):
     def output(self, report: bytes, now: float) -> None:
         self._to_board.append((now + self._link, report))
 
-    def _read(self) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
+    def _read(self) -> NDArray[np.float32]:
         position, step = self._sample["position"][0], self.sheet.resolution
         read = step * np.round(position / step) if step else position
-        return read.astype(np.float32)
+        return np.asarray(read, np.float32)
 
     def _tick(self, due: float) -> None:
         before = self._sample["position"][0].copy()
-        self._library.board_tick(self._board, floats(self._read()), _us(due), floats(self.force))
+        if not self.skip_every or self._ticks % self.skip_every:
+            own = self._board, floats(self._read()), _us(due), floats(self.force)
+            self._library.board_tick(*own)
         self._sent[:3] = self.force
         self._mechanics.write(self._sent)
         self._mechanics.read(self._sample)

@@ -156,6 +156,11 @@ def data_sheet(
         known["force_limit"] = USUAL_FORCE_LIMIT
     if not turns:
         known["torque_limit"] = USUAL_TORQUE_LIMIT
+    if (rate := changes.get("loop_rate")) not in (None, 0.0, known["loop_rate"]):
+        raise DeviceError(
+            f"loop_rate is {rate:g} Hz; it must be 0, with which the bridge's loop pulls at {name} "
+            "in place of its own"
+        )
     known |= changes
     must = [*_MUST_SAY, *["force_limit"] * moves, *["torque_limit"] * turns]
     if missing := [field for field in must if known[field] is None]:

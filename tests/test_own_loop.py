@@ -1,0 +1,215 @@
+"""Runs on a device with a loop of its own, whose firmware is compiled here, in virtual time."""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from board_attack import built_loop
+from emulated.board_model import BoardSheet, LoopBoard
+from emulated.hid_seam import DrivingClock, HidSeam
+from firmware_build import COMPILER
+
+import hapticbridge as hb
+from hapticbridge.demand.own_loop import REPORT_DTYPE, ROUNDING, OwnLoopTally
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.device.driver import ignore_message
+from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
+from hapticbridge.device.simulated.device import hand_for
+from hapticbridge.errors import DeviceError
+from hapticbridge.run.commands import Couple, Reset, Switch
+
+pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler on this machine")
+
+STIFF = {"stiffness": 15e3, "damping": 0.0}
+
+
+@pytest.fixture(scope="module", name="library")
+def _library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    return built_loop(tmp_path_factory.mktemp("loop"))
+
+
+class Bench:
+    """A board behind the real driver, in a hand that goes with a scene."""
+
+    def __init__(
+        self,
+        library: ctypes.CDLL,
+        scene: str = "virtual_wall",
+        sheet: BoardSheet | None = None,
+        link: float = 0.5e-3,
+        **options: object,
+    ) -> None:
+        self.scene, own = hb.load_scene(scene), sheet or BoardSheet()
+        hand = hand_for(self.scene)
+        mechanics = SimulatedDevice(
+            hand=hand, mass=own.mass, damping=own.damping, friction=own.friction
+        )
+        self.board = LoopBoard(library, mechanics, own, link)
+        self.seam = HidSeam(self.board)
+        self.device: RawHidDevice = open_rawhid(
+            options, ignore_message, self.seam, lambda: self.seam.now
+        )
+
+    def bridge(self, coupling: Any = None, **options: Any) -> hb.Bridge:
+        clock = DrivingClock(self.seam)
+        return hb.Bridge(self.scene, self.device, coupling=coupling, clock=clock, **options)
+
+    @property
+    def gained(self) -> float:
+        """Energy in J that the motors gave the handle beyond what its damping burned."""
+        return self.board.work - self.board.burned
+
+
+def test_the_boards_loop_bears_what_the_hosts_does_not(library: ctypes.CDLL) -> None:
+    """The same device behind the same link, 2 ms to and fro, at the same wall."""
+    stiff = Bench(library, link=1e-3)
+    with stiff.bridge(STIFF) as bridge:
+        summary = bridge.run(2.0)
+    assert summary.is_certified
+    assert summary.environment == "strict"
+    assert stiff.gained < ROUNDING
+
+    usual = Bench(library, link=1e-3, loop_rate=0.0)
+    assert usual.device.info.loop_period is None
+    with usual.bridge() as bridge:
+        summary = bridge.run(2.0)
+        assert bridge.setup.law.stiffness < 1e3
+    assert summary.is_certified
+    assert usual.gained < ROUNDING
+
+    swinging = Bench(
+        library, sheet=BoardSheet(friction=0.0, resolution=0.0), link=1e-3, loop_rate=0.0
+    )
+    with swinging.bridge(STIFF) as bridge:
+        summary = bridge.run(2.0)
+    assert not summary.is_certified
+    assert swinging.gained > 1e3 * ROUNDING
+
+
+SCENES = "virtual_wall", "screwdriver", "hammer", "point_mass"
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("link", [0.0, 2e-3, 10e-3])
+def test_no_hand_gains_energy_whatever_the_link(
+    library: ctypes.CDLL, scene: str, link: float
+) -> None:
+    bench = Bench(library, scene, BoardSheet(friction=0.0, resolution=0.0), link)
+    with bench.bridge() as bridge:
+        summary = bridge.run(1.5)
+        own = bridge.session.setup.law
+    assert own.damping == 0.0
+    assert summary.is_certified
+    assert bench.gained < ROUNDING
+
+
+def test_a_scene_may_be_scaled_turned_and_slow(library: ctypes.CDLL, tmp_path: Path) -> None:
+    """The board's tool, in the device's frame, is where the scene has it."""
+    turned = hb.Workspace(scale=2.0, axes=((0, 1, 0), (0, 0, 1), (1, 0, 0)))
+    bench = Bench(library, "point_mass", BoardSheet(friction=0.0, resolution=0.0))
+    path, found = tmp_path / "run.mcap", {}
+    options: dict[str, Any] = {"workspace": turned, "rate": 250.0, "recording": path}
+    with bench.bridge(**options) as bridge:
+
+        def on_tick(tick: int) -> None:
+            report = bench.device.loop_report
+            if tick > 100 and report is not None and report.tool not in found:
+                [row] = bridge.latest_records(1)
+                found[report.tool] = row["tool_position"].copy()
+
+        summary = bridge.run(1.5, on_tick)
+        parameters = bridge.session.parameters
+    shown, tool = np.array(list(found)), np.array(list(found.values()))
+    origin = np.array(parameters.device_origin[:3])
+    axes = np.array(parameters.axes).reshape(3, 3)
+    mapped = parameters.handle_origin[:3] + 2.0 * (shown - origin) @ axes.T
+    assert np.ptp(tool, axis=0).max() > 0.01
+    assert np.abs(mapped - tool).max() < 0.1 * np.ptp(tool, axis=0).max()
+    assert summary.is_certified
+    assert bench.gained < ROUNDING
+    assert hb.audit(path, in_process=True).verdict == "passive"
+
+
+def test_a_recorded_run_repeats_to_the_bit_with_commands(
+    library: ctypes.CDLL, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    bench = Bench(library, "screwdriver")
+    commands: dict[int, Any] = {
+        400: Couple(stiffness=3e3, damping=0.0),
+        700: Switch(force=False),
+        900: Switch(force=True),
+        1200: Reset(),
+    }
+    with bench.bridge(recording=path) as bridge:
+
+        def on_tick(tick: int) -> None:
+            if tick in commands:
+                bridge.command(commands[tick])
+
+        bridge.run(1.0, on_tick)
+        bridge.run(1.0, on_tick)
+    report = hb.audit(path, in_process=True)
+    assert (report.verdict, report.agreement) == ("passive", "bit for bit")
+    assert report.certification is not None
+    assert report.certification.own_loop is not None
+    live = bridge.summary().certification.own_loop
+    assert report.certification.own_loop == live
+    assert "its board alone knows" in report.unchecked
+    assert bench.gained < ROUNDING
+
+
+def test_a_force_that_is_off_stays_off_and_comes_back(library: ctypes.CDLL) -> None:
+    bench = Bench(library)
+    with bench.bridge() as bridge:
+        bridge.run(0.8)
+        assert np.linalg.norm(bench.board.force) > 1.0
+        bridge.command(Switch(force=False))
+        bridge.run(0.5)
+        assert np.linalg.norm(bench.board.force) == 0.0
+        bridge.command(Switch(force=True))
+        bridge.run(0.5)
+        assert np.linalg.norm(bench.board.force) > 1.0
+    bench.seam.advance(bench.seam.now + 0.05)
+    assert np.linalg.norm(bench.board.force) == 0.0
+
+
+def test_periods_that_the_board_misses_count(library: ctypes.CDLL) -> None:
+    bench = Bench(library, sheet=BoardSheet(resolution=0.0, friction=0.0))
+    with bench.bridge({"stiffness": 30e3, "damping": 0.0}) as bridge:
+        bench.board.skip_every = 4
+        summary = bridge.run(1.0)
+    own = summary.certification.own_loop
+    assert own is not None
+    assert own.missed > 2000
+    assert summary.certification.is_by_time
+    assert not summary.is_certified
+    assert "10 kHz" in str(summary)
+
+
+def reports(*rows: tuple[int, float, float, float]) -> Any:
+    return np.array(list(rows), REPORT_DTYPE)
+
+
+def test_a_board_that_gives_more_than_the_scene_released_is_found() -> None:
+    tally = OwnLoopTally.begin(1e-4, 0.0)
+    # the scene released 5 mJ, and took it again: the hand may keep what it got
+    tally.add(reports((0, -5e-3, -1e-3, 4e-3), (1, 0.0, -5e-3, -5e-3)), {})
+    assert tally.account.first_excess is None
+    tally.add(reports((2, 0.0, -5.1e-3, -5e-3)), {})
+    first = tally.account.first_excess
+    assert first is not None
+    assert first == (2, pytest.approx(1e-4))
+    assert "does not keep its account" in tally.account.fault
+
+
+def test_what_a_board_cannot_have_is_left_to_the_bridge(library: ctypes.CDLL) -> None:
+    with pytest.raises(DeviceError, match="loop_rate is 5000 Hz; it must be 0"):
+        Bench(library, loop_rate=5e3)
+    refused = Bench(library, "point_mass")
+    with refused.bridge(method="weld", i_know=True) as bridge:
+        assert not bridge.setup.info.loop_period
