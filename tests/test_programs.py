@@ -31,7 +31,7 @@ def test_the_first_run_and_its_audit_load_what_was_compiled_ahead(tmp_path: Path
     command = [sys.executable, "-c", NOTED, str(tmp_path / "a.mcap")]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=300.0, check=True)
     names = {each.function.file_name(each.arguments, each.c_types) for each in programs()}
-    # the point mass has no boxes, and its device takes the handle from where it is
-    needless = "box_box", "flat_flat", "round_flat", "stretch_at"
+    # the point mass has no boxes, and its device takes the handle from where it is and has no loop
+    needless = "box_box", "flat_flat", "round_flat", "stretch_at", "shown_to_device"
     asked = {line for line in ended.stderr.splitlines() if line.endswith(".o")}
     assert {name for name in names if not name.startswith(needless)} <= asked

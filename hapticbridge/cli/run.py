@@ -158,6 +158,13 @@ def _announce_damping(setup: RunSetup, named: Mapping[str, float]) -> None:
 def _announce_own_rate(setup: RunSetup) -> None:
     """Says what stiffness a device slower than the loop would bear at a rate of its own."""
     info, own = setup.info, device_period(setup.info, setup.period)
+    if info.loop_period is not None:
+        rate, scene_rate = format_si(1 / info.loop_period, "Hz"), format_si(1 / setup.period, "Hz")
+        err.print(
+            f"  a loop of the device's own renders the coupling at {rate}; the scene steps at "
+            f"{scene_rate}, behind its link"
+        )
+        return
     if own == setup.period or not setup.method.has_law or info.damping is None:
         return
     scales, method = setup.workspace.scales, setup.method
@@ -504,7 +511,8 @@ class Run:
     def _for_devices(self, infos: Sequence[DeviceInfo]) -> Run:
         """Returns the run at the rate for its devices; says if that is not the usual one."""
         options = self.options.for_devices(infos)
-        if self.options.rate is None and options.loop_rate < USUAL_RATE:
+        is_own = any(info.loop_period is not None for info in infos)
+        if self.options.rate is None and options.loop_rate < USUAL_RATE and not is_own:
             notify(
                 f"the loop runs at {options.loop_rate:.4g} Hz, as often as the device has a new "
                 f"sample: it bears stiffer walls so than at {USUAL_RATE:g} Hz (--rate sets another)"

@@ -14,7 +14,7 @@ from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progr
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import DampingCondition, conditions_of
-from hapticbridge.demand.loop_setting import IN_TIME, Lag, LoopSetting, delay_ticks
+from hapticbridge.demand.loop_setting import IN_TIME, Lag, LoopSetting, delay_ticks, pulling_loop
 from hapticbridge.demand.methods import RunCoupling, default_method
 from hapticbridge.demand.plots import (
     Alternative,
@@ -320,6 +320,9 @@ class Bound:
         info = self._info()
         rate = rate_for(self.rate, info)
         period = period_of(rate)
+        if info is not None:
+            info, period = pulling_loop(info, period)
+            rate = 1.0 / period
         coupling = Coupling(self.stiffness, self.damping, 0.0, 0.0)
         filter_time = period if self.filter_time is None else self.filter_time
         ways = alternatives(coupling, period, filter_time)

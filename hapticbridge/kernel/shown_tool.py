@@ -62,7 +62,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.kernel.codes import Part, State
 from hapticbridge.kernel.force_level import limited_wrench
-from hapticbridge.kernel.handle import device_from_scene, grip_pose, note_tool
+from hapticbridge.kernel.handle import device_from_scene, grip_pose, note_tool, scene_from_device
 from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import (
     energy_at_level,
@@ -362,6 +362,9 @@ def _take_planes(s: State, scene: State) -> None:
 
 # To a loop of the device's own
 
+ALIKE = 0.999
+"""Least cosine of the angle between two surfaces that count as one, 2.6°."""
+
 
 @compiled
 def shown_to_device(state: NDArray[np.void], lead: float, numbers: NDArray[np.float64]) -> int:
@@ -395,6 +398,7 @@ def shown_to_device(state: NDArray[np.void], lead: float, numbers: NDArray[np.fl
     store_vector(numbers[3:6], device_from_scene(run.axes, scaled(1.0 / run.scale, velocity)))
     numbers[6] = run.force_scale / run.scale * s.energy.coupling_work
     moved = add(subtract(tool, vector_of(shown.before)), ahead)
+    # several contacts of one face are one surface to a tool that moves along lines
     turned = rotation_between(quaternion_of(shown.before[3:7]), turn)
     count = 0
     for first in range(7, numbers.size - 3, 4):
@@ -403,6 +407,10 @@ def shown_to_device(state: NDArray[np.void], lead: float, numbers: NDArray[np.fl
             normal = vector_of(shown.normals[3 * k : 3 * k + 3])
             arm = vector_of(shown.arms[3 * k : 3 * k + 3])
             gap = shown.gaps[k] + dot(normal, add(moved, cross(turned, arm)))
+            for earlier in range(7, first, 4):
+                known = scene_from_device(run.axes, vector_of(numbers[earlier : earlier + 3]))
+                if dot(known, normal) > ALIKE:
+                    gap = np.inf
             if gap < least:
                 nearest, least = k, gap
         if nearest < 0:
@@ -410,7 +418,6 @@ def shown_to_device(state: NDArray[np.void], lead: float, numbers: NDArray[np.fl
         normal = vector_of(shown.normals[3 * nearest : 3 * nearest + 3])
         store_vector(numbers[first : first + 3], device_from_scene(run.axes, normal))
         numbers[first + 3] = least / run.scale
-        shown.gaps[nearest] = np.inf
         count += 1
     return count
 

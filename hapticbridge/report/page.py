@@ -77,7 +77,7 @@ _NAMES = {
 
 _DEVICE = {"name": "", "axes": ""} | DATA_SHEET_UNITS
 
-_WITHOUT = {"rate": "the loop's", "duration": "without end"}
+_WITHOUT = {"rate": "the loop's", "duration": "without end", "loop_period": "no own loop"}
 """Meaning of a missing value in the data sheet; any other missing value is unknown."""
 
 _GUARD = {

@@ -50,6 +50,7 @@ class OwnLoop:
         self._parameters = parameters
         self._numbers = np.zeros(7 + 4 * SURFACES)
         self._lead = lead = device.info.delay or 0.0  # to the coming of what answers a sample
+        self._passing = 2.0 * parameters.force_limit * FASTEST * (parameters.period + lead)
         self._show = direct(shown_to_device, bound.state, lead, self._numbers)
         loop, guard = bound.state["loop"], bound.state["guard"]
         self._reported, self._tick = loop["reported"][0], loop["tick"]
@@ -72,7 +73,7 @@ class OwnLoop:
         place, tick = state.echo % _REMEMBERED, int(self._tick[0])
         self._reports.append((tick, float(self._works[place]), state.passed, state.tank))
         if self._sent[place] >= 0 and not flags:
-            took = self._parameters.period * (tick - self._sent[place])
+            took = self._parameters.period * float(tick - self._sent[place])
             self._lead += AGILITY * (took - self._lead)
         return flags
 
@@ -111,7 +112,7 @@ class OwnLoop:
             stiffness=ratio * float(gains["stiffness"][0]),
             damping=ratio * float(gains["damping"][0]),
             level=force,
-            passing=2.0 * force * FASTEST * (own.period + self._lead),
+            passing=cap * self._passing,
             fade=own.period * (own.guarding.fade_ticks if is_risen else max(own.ramp_ticks, 1)),
         )
 

@@ -188,6 +188,11 @@ def what_ifs(
             f"another program stepped the scene of '{report.path}': what it would have shown under "
             "other settings is not known"
         )
+    if report.certification is not None and report.certification.own_loop is not None:
+        raise RecordingError(
+            f"a loop of the device's own pushed the hand of '{report.path}': what it would have "
+            "done under other settings is not known"
+        )
     recordings = read_hands(path)
     with TemporaryDirectory(prefix="hapticbridge-") as name:
         folder = Path(name)

@@ -20,7 +20,7 @@ STATE_PERIOD = 1.01e-3
 
 @dataclass(frozen=True, kw_only=True)
 class BoardSheet:
-    """What a board says of itself: axes as bits, and numbers in SI units."""
+    """Data sheet of a board: axes as bits, and numbers in SI units."""
 
     axes: int = 0b111
     period: float = 1e-4

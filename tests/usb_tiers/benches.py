@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import time
 from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
+from emulated.board_model import BoardSheet, LoopBoard
 from emulated.falcon_model import FalconModel
 from emulated.handle import Handle, planar_hand
 from emulated.pid_layouts import ODD, USUAL
@@ -86,6 +88,20 @@ def free_rawhid(serial: str = "R1") -> RawHid:
     """Returns a home-made device that nobody holds, without friction."""
     claims = Claims(mass=MASS, damping=DAMPING)
     return RawHid(SimulatedDevice(mass=MASS, damping=DAMPING, hand=None), claims, serial=serial)
+
+
+def board(library: ctypes.CDLL) -> LoopBoard:
+    """Returns a home-made device with a loop of its own, in a hand that taps on a wall.
+
+    The hand rests for 0.6 s, then goes out along x and back within 0.6 s.
+    """
+    times = np.arange(0.0, 60.0, 0.02)
+    out = np.maximum(np.mod(times, 1.2) / 0.6 - 1.0, 0.0)
+    places = np.zeros((len(times), 3))
+    places[:, 0] = 0.015 * np.sin(np.pi * out) ** 2
+    mechanics = SimulatedDevice(mass=0.1, damping=2.0, friction=0.1, path=Motion(times, places))
+    # slow enough for this process on a wall clock
+    return LoopBoard(library, mechanics, BoardSheet(period=2.5e-4))
 
 
 def stick(serial: str = "P1") -> PidStick:

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from board_attack import built_loop
 from emulated.falcon_model import Faults
 from emulated.spacemouse_model import SpaceMouse
 from emulated.usb_device import UsbDevice
+from firmware_build import COMPILER
 from numpy.typing import NDArray
 
 import hapticbridge as hb
@@ -254,6 +256,22 @@ def _pulled_out_of_a_run(
     wait_for(lambda: not plugged_devices())
     plug(make)
     _opened(specification).close()
+
+
+@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
+@pytest.mark.usefixtures("no_spin")
+def test_a_board_renders_a_wall_by_itself(plug_hid: Plug, tmp_path: Path) -> None:
+    library, file = built_loop(tmp_path), tmp_path / "run.mcap"
+    model = plug_hid(lambda: benches.board(library))
+    wait_for(usable_devices)
+    with hb.Bridge("virtual_wall", "rawhid", recording=file) as bridge:
+        summary = bridge.run(2.0)
+    own = summary.certification.own_loop
+    assert own is not None
+    assert own.excess_tick < 0
+    assert summary.peak_force > 1.0
+    assert model.get("work") < model.get("burned") + 1e-6
+    assert hb.audit(file, in_process=True).verdict == "passive"
 
 
 @pytest.mark.usefixtures("no_spin")

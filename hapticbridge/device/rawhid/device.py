@@ -52,6 +52,11 @@ from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.kernel.pose import canonical, quaternion_exp
 from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
+SLOTS = 3
+"""Kinds of frames of which the newest alone is sent: surfaces, then the tool or force that they
+belong to, then the setting of a loop on the board."""
+_SURFACES, _COMMAND, _SETTING = range(SLOTS)
+
 
 class FrameLink(Protocol):
     """Link that carries frames: a ``HidLink``, or a ``serial.SerialLink``."""
@@ -62,8 +67,11 @@ class FrameLink(Protocol):
     def wait(self, timeout_ms: int) -> bytes:
         """Returns the next frame; empty after ``timeout_ms``, >= 1."""
 
-    def write(self, report: bytes) -> None:
-        """Sends a frame after a byte 0, which hidapi requires for reports without a number."""
+    def write(self, report: bytes, slot: int = 0) -> None:
+        """Sends a frame after a byte 0, which hidapi requires for reports without a number.
+
+        It may replace an unsent one in its slot, of which there are ``SLOTS``, sent in turn.
+        """
 
     def close(self) -> None:
         """Sends the remaining frame and releases the device."""
@@ -395,7 +403,7 @@ class RawHidDevice:
 
     def set_loop(self, setting: BoardSetting) -> None:
         """Sets the coupling that its own loop renders (``device.own_loop``)."""
-        self._send(setting_frame(self._next(), setting))
+        self._send(setting_frame(self._next(), setting), _SETTING)
 
     def show(self, shown: ShownTool) -> int:
         """Shows the tool to its own loop, whose force fades after the watchdog's time without one.
@@ -407,8 +415,10 @@ class RawHidDevice:
         """
         if self.last_word is not None:
             self.last_word.beat(has_force=shown.is_enabled)
-        for frame in show_frames(self._next(), shown, self._watchdog_ms):
-            self._send(frame)
+        *surfaces, tool = show_frames(self._next(), shown, self._watchdog_ms)
+        for frame in surfaces:
+            self._send(frame, _SURFACES)
+        self._send(tool)
         return self._sequence
 
     @property
@@ -450,8 +460,9 @@ class RawHidDevice:
         self._sequence = (self._sequence + 1) & 0xFFFF
         return self._sequence
 
-    def _send(self, frame: bytes) -> None:
-        self._link.write(b"\0" + frame)  # hidapi requires a leading 0 for reports without a number
+    def _send(self, frame: bytes, slot: int = _COMMAND) -> None:
+        # hidapi requires a leading 0 for reports without a number
+        self._link.write(b"\0" + frame, slot)
 
 
 # Discovery of home-made devices
@@ -472,7 +483,7 @@ def open_rawhid(
         DeviceError: No device is found, it cannot be opened, or it has another protocol.
     """
     changes = {key: options[key] for key in (*CHANGES, *GRIP_CHANGES) if key in options}
-    with opened(DRIVER, options, api) as (plugged, link):
+    with opened(DRIVER, options, api, slots=SLOTS) as (plugged, link):
         device = RawHidDevice(link, str(plugged), changes, now)
     device.info = replace(device.info, serial=plugged.serial)
     if api is None:

@@ -35,6 +35,7 @@ from hapticbridge.device.rawhid.device import (
     CHANGES,
     GRIP_CHANGES,
     NO_WRENCH,
+    SLOTS,
     RawHidDevice,
     refuse_other_version,
 )
@@ -203,7 +204,8 @@ class SerialLink:
     def __init__(self, port: SerialPort, name: str, ports: SystemPorts, log: HexLog) -> None:
         self._port, self._name, self._ports, self._log = port, name, ports, log
         self._waiting: deque[bytes] = deque()
-        self._newest: bytes | None = None
+        self._newest: list[bytes | None] = [None] * SLOTS
+        self._turn = 0
         self._idle_since = ports.now()
         self._lost, self._is_open = "", True
         self.frames, self.received = FrameReader(), 0
@@ -231,26 +233,26 @@ class SerialLink:
             self._await_news(timeout_ms)
         return self._waiting.popleft() if self._waiting else b""
 
-    def write(self, report: bytes) -> None:
-        """Sends a frame after a byte 0, which is not sent; it replaces an unsent one.
+    def write(self, report: bytes, slot: int = 0) -> None:
+        """Sends a frame after a byte 0, which is not sent; it replaces an unsent one in its slot.
 
         Raises:
             DeviceLost: The port is gone, or accepted nothing for ``MAX_WRITE``.
         """
-        self._newest = report[1:]
+        self._newest[slot] = report[1:]
         self._send()
 
     def close(self) -> None:
-        """Sends the remaining frame, for at most two ``MAX_WRITE``, and releases the port."""
+        """Sends the remaining frames, each for at most ``MAX_WRITE``, and releases the port."""
         if not self._is_open:
             return
         try:
             with contextlib.suppress(DeviceLost, OSError):
                 if not self._is_drained():
                     self._port.reset_output_buffer()  # the port would wait for it on closing
-                elif self._newest is not None:
+                while any(self._newest) and self._is_drained():
                     self._send()
-                    self._is_drained()
+                self._is_drained()
         finally:
             self._is_open = False
             with contextlib.suppress(OSError):
@@ -283,16 +285,19 @@ class SerialLink:
 
     def _send(self) -> None:
         self._refuse_lost()
-        frame = self._newest
-        if frame is None:
+        waiting = [slot for slot, each in enumerate(self._newest) if each is not None]
+        if not waiting:
             return
+        later = [slot for slot in waiting if slot > self._turn]  # slots take turns
+        slot = later[0] if later else waiting[0]
+        frame = self._newest[slot] or b""
         now = self._ports.now()
         try:
             if self._port.out_waiting:
                 if now - self._idle_since > MAX_WRITE:
                     raise TimeoutError
                 return
-            self._idle_since, self._newest = now, None
+            self._idle_since, self._newest[slot], self._turn = now, None, slot
             if self._port.write(frame) != len(frame):
                 raise TimeoutError
         except OSError:  # among them pyserial's own errors
