@@ -116,6 +116,7 @@ class OwnLoopTally:
 
     account: OwnLoopAccount
     _first: Mapping[str, float] | None = None
+    _before: float | None = None  # what the loop had passed on before the run
 
     @classmethod
     def begin(cls, period: float, resolution: float) -> OwnLoopTally:
@@ -126,15 +127,18 @@ class OwnLoopTally:
         """Adds reports, and counters of the loop if they are known."""
         own = self.account
         if reports.size:
+            if self._before is None:
+                self._before = float(reports["passed"][0])
+            passed = reports["passed"] - self._before
             released = np.maximum(np.maximum.accumulate(-reports["work"]), own.released)
-            over = -reports["passed"] - released
+            over = -passed - released
             beyond = np.flatnonzero(over > ROUNDING)
             tick = own.excess_tick
             if tick < 0 and beyond.size:
                 tick = int(reports["tick"][beyond[0]])
             own = replace(
                 own,
-                passed=float(reports["passed"][-1]),
+                passed=float(passed[-1]),
                 work=float(reports["work"][-1]),
                 released=float(released[-1]),
                 excess=max(own.excess, float(over.max())),

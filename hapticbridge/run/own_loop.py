@@ -57,7 +57,7 @@ class OwnLoop:
         self._lever, self._cap = guard["lever"], bound.state["watch"]["max_lever"]
         self._coupling, self._level = bound.state["coupling"], bound.state["level"]["level"][0]
         self._told: tuple[float, ...] = ()
-        self._told_tick = 0
+        self._told_tick, self._is_followed = 0, False
         self._works, self._sent = np.zeros(_REMEMBERED), np.full(_REMEMBERED, -1, np.int64)
         self._reports: list[tuple[int, float, float, float]] = []
         self.tally = OwnLoopTally.begin(parameters.loop_period, parameters.guarding.resolution)
@@ -69,7 +69,7 @@ class OwnLoop:
         if state is None:  # it follows no tool yet, and has no force
             self._reported[:] = 0.0
             return flags
-        self._reported[:3] = state.force
+        self._reported[:3], self._is_followed = state.force, True
         place, tick = state.echo % _REMEMBERED, int(self._tick[0])
         self._reports.append((tick, float(self._works[place]), state.passed, state.tank))
         if self._sent[place] >= 0 and not flags:
@@ -87,7 +87,12 @@ class OwnLoop:
             for nx, ny, nz, gap in zip(*[iter(planes[: 4 * count])] * 4, strict=True)
         )
         shown = ShownTool(
-            (x, y, z), (vx, vy, vz), work, surfaces, is_enabled=bool(self._lever[0] > 0.0)
+            (x, y, z),
+            (vx, vy, vz),
+            work,
+            surfaces,
+            is_placed=not self._is_followed,
+            is_enabled=bool(self._lever[0] > 0.0),
         )
         place = self._device.show(shown) % _REMEMBERED
         self._works[place], self._sent[place] = work, self._tick[0]

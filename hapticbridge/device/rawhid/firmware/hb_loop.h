@@ -134,20 +134,25 @@ class HbLoop {
     cap_ = hb_picojoules(held + setting.passing);
   }
 
-  // Ends the force at once, until a setting enables it again, and forgets the scene: another one's
-  // work begins at 0, and nothing of the tank is left for it.
+  // Ends the force at once, until a setting enables it again. Nothing of the tank is left for what
+  // is shown then, but a loan stays.
   void end() {
     setting_.is_enabled = false;
     share_ = 0.0f;
     memset(&gains_, 0, sizeof gains_);
-    report_.tank = report_.passed = scene_work_ = 0;
+    if (report_.tank > 0) report_.tank = 0;
     has_shown_ = false;
   }
 
   // Shows the tool. `placed`: it was put there, and the force begins anew.
   void show(const HbShown& shown, bool placed) {
     const float since = fminf((float)(silence_ < 1 ? 1 : silence_) * period_, HB_SLOWEST);
-    report_.tank -= shown.work - scene_work_;
+    HbEnergy taken = shown.work - scene_work_;
+    if (placed) {  // it may be another scene, which gives back nothing that this one took
+      taken = positive(shown.work) - positive(scene_work_);
+      if (taken < 0) taken = 0;
+    }
+    report_.tank -= taken;
     scene_work_ = shown.work;
     shown_ = shown;
     age_ = silence_ = 0;
@@ -215,6 +220,8 @@ class HbLoop {
   const HbReport& report() const { return report_; }
 
  private:
+  static HbEnergy positive(HbEnergy energy) { return energy > 0 ? energy : 0; }
+
   static void copy(float to[3], const float from[3]) { memcpy(to, from, 3 * sizeof(float)); }
 
   static void subtract(const float a[3], const float b[3], float result[3]) {
