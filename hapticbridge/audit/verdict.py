@@ -527,6 +527,7 @@ class JudgedDevice:
         """
         run, recording = hand.run, hand.recording
         info, method, parameters = run.info, run.method, run.parameters
+        where_felt = parameters.grip, parameters.scale, parameters.force_scale
         try:
             coupling = RunCoupling.of(
                 method,
@@ -536,7 +537,7 @@ class JudgedDevice:
                 measured=parameters.effective,
                 is_always_implicit=not parameters.scene_ticks
                 and was_never_lossless(recording.count, recording.flags),
-            ).felt_at(parameters.grip, parameters.scale, parameters.force_scale)
+            ).felt_at(*where_felt, is_apart=parameters.is_apart)
             conditions = run_conditions(info, run.worst, method)
             return cls(
                 grip=recording.meta.get("grip", ""),

@@ -96,7 +96,9 @@ def announce(setup: RunSetup, named: Mapping[str, float], *, is_method_chosen: b
     held = is_always_implicit(setup.scene.model, setup.scene.grip)
     rendered = RunCoupling.of(method, setup.timestep, setup.coupling, is_always_implicit=held)
     scales = setup.workspace.scales
-    for sentence in rendered.felt_at(setup.scene.grip, *scales).sentences(setup.info):
+    is_apart = setup.info.loop_period is not None
+    felt = rendered.felt_at(setup.scene.grip, *scales, is_apart=is_apart)
+    for sentence in felt.sentences(setup.info):
         err.print(f"  {sentence}")
     coarse = coarse_spring(setup.scene.model, setup.scene.grip, method)
     if coarse:

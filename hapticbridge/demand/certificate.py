@@ -399,7 +399,8 @@ def _remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
         return "lower stiffness or damping, or raise the rate"
     if available <= 0.0:
         return "a device without damping bears no coupling"
-    if loop.law_evaluations == 1 and loop.lag != IN_TIME:
+    is_own = loop.info.loop_period is not None
+    if loop.law_evaluations == 1 and loop.lag != IN_TIME and not is_own:
         return _late_remedy(loop, axis, available)
     prefix, spring, damper = _SETTINGS[axis]
     parts: tuple[_Part, ...] = ("stiffness", "damping")

@@ -303,13 +303,18 @@ class RunCoupling:
             _acting(law, timestep, IMPLICIT_SHARE) if is_implicit else None,
         )
 
-    def felt_at(self, grip: str, scale: float, force_scale: float) -> RunCoupling:
+    def felt_at(
+        self, grip: str, scale: float, force_scale: float, *, is_apart: bool = False
+    ) -> RunCoupling:
         """Returns the coupling as a hand feels it: for a joint, at the fingers in N/m and N s/m.
 
             K_fingers = scale · force_scale · K
 
-        Any other grip's coupling stays as it is.
+        A loop of the device's own (``is_apart``) adds no damping to the law's. Any other coupling
+        stays as it is.
         """
+        if is_apart:
+            return replace(self, effective=self.law, near_contact=None, remark="in its own loop")
         if not Grip.from_text(grip).is_joint:
             return self
         ratio = scale * force_scale

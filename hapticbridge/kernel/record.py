@@ -146,7 +146,8 @@ def force_on_hand(ticks: NDArray[np.void], axes: ArrayLike) -> NDArray[np.float6
     """Returns the force of the device on the hand in the scene's frame, (n, 3) in N.
 
     It is ``wrench_on_device``, what the motors were sent, and opposite to the force on the tool
-    times ``force_scale`` and the recorded lever.
+    times ``force_scale`` and the recorded lever. With a loop of the device's own it is what that
+    reported at the sample.
 
     Args:
         ticks: Records, ``TICK_DTYPE``, (n,).

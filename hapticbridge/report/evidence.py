@@ -51,7 +51,9 @@ def recorded_coupling(recording: Recording) -> RunCoupling:
         law=parameters.coupling,
         measured=parameters.effective,
         is_always_implicit=was_always_implicit(recording.ticks),
-    ).felt_at(parameters.grip, parameters.scale, parameters.force_scale)
+    ).felt_at(
+        parameters.grip, parameters.scale, parameters.force_scale, is_apart=parameters.is_apart
+    )
 
 
 Array = NDArray[np.float64]

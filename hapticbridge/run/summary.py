@@ -487,6 +487,7 @@ class Summary:
         )
         peaks: dict[str, Any] = {name: float(state["loop"][name][0]) for name in _PEAKS}
         hand = HandEnergy() if info.is_prescribed else hand_energy(state, parameters)
+        where_felt = parameters.grip, parameters.scale, parameters.force_scale
         certification = certification_of(info, parameters, method, times, hand, outcome.own_loop)
         return cls(
             ticks=outcome.ticks,
@@ -515,7 +516,7 @@ class Summary:
                 is_always_implicit=outcome.ticks > 0
                 and not parameters.scene_ticks
                 and not state["lossless"]["ticks"][0],
-            ).felt_at(parameters.grip, parameters.scale, parameters.force_scale),
+            ).felt_at(*where_felt, is_apart=parameters.is_apart),
             fault=_fault(ledger, state, certification),
             conditions=condition_sentences(info, parameters, method),
             certification=certification,
