@@ -11,7 +11,7 @@ static inline uint32_t micros() { return hardware; }
 
 #include "hb_sketch.h"
 
-static HbMotor motor = {0.0136f, 2.5f, 12.0f, 0.2f, 0.005f, false};
+static HbMotor motor = {0.0136f, 2.5f, 0.2e-3f, 12.0f, 0.2f, 0.005f, false};
 
 void read_position(float position[3]) {
   for (int i = 0; i < 3; i++) position[i] = 1e-5f * (float)(int32_t)hardware;

@@ -470,7 +470,7 @@ def test_the_serial_sketch_tells_of_its_loop_and_never_waits(
     frames = protocol.FrameReader().take(data.raw[:count])
     told = [protocol.decoded(frame) for frame in frames]
     sheet = next(each for each in told if isinstance(each, protocol.Numbers))
-    assert (sheet.loop_rate, sheet.loop_delay) == pytest.approx((10e3, 30e-6))
+    assert (sheet.loop_rate, sheet.loop_delay) == pytest.approx((10e3, 140e-6))
     loops = [each for each in told if isinstance(each, LoopState)]
     reports = [each for each in told if isinstance(each, LoopReport)]
     assert len(loops) + len(reports) >= 95  # a frame in each millisecond, from the second on

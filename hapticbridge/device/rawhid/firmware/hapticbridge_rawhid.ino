@@ -31,8 +31,8 @@ const float HANDLE = 0.070f;                  // m, from the paddle's axis to th
 const float TRAVEL = HANDLE * MOTOR_PULLEY / SECTOR;         // m of handle per rad of the motor
 const float STEP = TRAVEL * 6.2831853f / COUNTS_PER_TURN;  // m of handle per count
 
-// N m/A, ohm, V, and the share of full PWM: raise it when it has proved safe
-HbMotor motor = {0.0136f, 2.5f, 12.0f, 0.2f, TRAVEL, false};
+// N m/A, ohm, H, V, and the share of full PWM: raise it when it has proved safe
+HbMotor motor = {0.0136f, 2.5f, 0.2e-3f, 12.0f, 0.2f, TRAVEL, false};
 
 const uint32_t LOOP_PERIOD_US = 100;
 // On full speed the host fetches one report a millisecond. A device that is faster, even by 50 ppm,
@@ -51,7 +51,7 @@ HbSheet my_sheet() {
   sheet.force_limit = motor.force_limit();
   sheet.speed_limit = 2.0f;  // m/s, faster than a hand moves it
   sheet.delay = 1e-6f * LOOP_PERIOD_US;
-  sheet.loop_delay = 10e-6f;  // s, from read_position() to the motor's force
+  sheet.loop_delay = 40e-6f + motor.lag();  // s: computing and a period of the PWM, and the motor
   return sheet;
 }
 

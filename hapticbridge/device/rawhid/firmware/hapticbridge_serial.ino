@@ -33,8 +33,8 @@ const float HANDLE = 0.070f;        // m, from the paddle's axis to the grip
 const float TRAVEL = HANDLE * MOTOR_PULLEY / SECTOR;  // m of handle per rad of the motor
 const float STEP = TRAVEL * 6.2831853f / (PERIODS_PER_TURN * SENSOR_SPAN);  // m of handle
 
-// N m/A, ohm, V, and the share of full PWM: raise it when it has proved safe
-HbMotor motor = {0.0136f, 2.5f, 12.0f, 0.2f, TRAVEL, false};
+// N m/A, ohm, H, V, and the share of full PWM: raise it when it has proved safe
+HbMotor motor = {0.0136f, 2.5f, 0.2e-3f, 12.0f, 0.2f, TRAVEL, false};
 
 // A frame takes 0.64 ms at this rate, which an ATmega328 at 16 MHz makes exactly; checking and
 // writing frames take that one about 0.5 ms per state.
@@ -54,7 +54,8 @@ HbSheet my_sheet() {
   sheet.force_limit = motor.force_limit();
   sheet.speed_limit = 2.0f;  // m/s, faster than a hand moves it
   sheet.delay = 1e-6f * LOOP_PERIOD_US;
-  sheet.loop_delay = HB_HAS_LOOP ? 30e-6f : 0.0f;  // s, from read_position() to the motor's force
+  // s, from read_position() to the motor's force: converting, a period of the PWM, and the motor
+  sheet.loop_delay = HB_HAS_LOOP ? 60e-6f + motor.lag() : 0.0f;
   return sheet;
 }
 

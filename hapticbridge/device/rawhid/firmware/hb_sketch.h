@@ -39,6 +39,7 @@ inline HbSheet hb_unknown_sheet() {
 struct HbMotor {
   float torque_constant;  // N m/A, the motor's data sheet
   float resistance;       // ohm, winding, driver and wires together
+  float inductance;       // H, winding
   float supply;           // V, at the driver
   float duty_limit;       // of full PWM, 0 to 1; raise it when it has proved safe
   float travel;           // m of handle per rad of the motor
@@ -55,6 +56,9 @@ struct HbMotor {
     is_saturated = fabsf(share) > 1.0f;
     return duty_limit * fmaxf(fminf(share, 1.0f), -1.0f);
   }
+
+  // Returns the time in s in which the current follows the voltage. It counts as a delay.
+  float lag() const { return inductance / resistance; }
 
   // Status bits of a state frame.
   uint8_t status() const { return is_saturated ? HB_SATURATED : 0; }
