@@ -55,6 +55,7 @@ enum { A2 = 16 };
 static int sensor = 500;
 static inline int analogRead(int) { return sensor; }
 static std::deque<unsigned char> line_in, received, sending, line_out;
+static int overrun = 0;
 struct SerialPort {
   void begin(unsigned long) {}
   int available() { return (int)received.size(); }
@@ -64,7 +65,10 @@ struct SerialPort {
     received.pop_front();
     return byte;
   }
-  void write(unsigned char byte) { sending.push_back(byte); }
+  void write(unsigned char byte) {
+    if (availableForWrite() <= 0) overrun++;  // it would wait
+    sending.push_back(byte);
+  }
 };
 __attribute__((unused)) static SerialPort Serial;
 static inline void move_lines() {
@@ -119,6 +123,7 @@ int sketch_fetch(unsigned char* frame) {
 }
 void sketch_turn(int count) { encoder_count = count; }
 int sketch_pin(int pin) { return pins[pin]; }
+int sketch_overrun() { return overrun; }
 int sketch_sections() { return sections; }
 int sketch_broken_sections() { return broken_sections; }
 }

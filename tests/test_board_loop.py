@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import math
-import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from board_attack import FLAGS, built_loop, floats, gained
+from board_attack import built_loop, floats, gained
+from board_processors import CORES, MOST, computed_here, computed_on, memory_on, missing
 from firmware_build import COMPILER
 from numpy.typing import NDArray
 
@@ -451,37 +450,24 @@ def test_a_fault_a_force_frame_and_silence_end_the_loops_force(library: ctypes.C
 
 # On the processors of boards
 
-CORES = {
-    "cortex-m7": ("fpv5-d16", "mps2-an500", "0", "0x20000000"),
-    "cortex-m33": ("fpv5-sp-d16", "mps2-an505", "0x10000000", "0x38000000"),
-}
-CROSS, EMULATOR = shutil.which("arm-none-eabi-g++"), shutil.which("qemu-system-arm")
-MOST = 2500
-"""Instructions of a period with three axes, of the 15 000 that 10 kHz leaves at 150 MHz."""
 
-
-def told(text: str) -> dict[str, int]:
-    return {name: int(value) for name, value in re.findall(r"^(.+) (\d+)$", text, re.MULTILINE)}
-
-
-@pytest.mark.skipif(
-    CROSS is None or EMULATOR is None,
-    reason="gcc-arm-none-eabi and qemu-system-arm are not installed",
-)
+@pytest.mark.skipif(bool(missing()), reason=missing())
 @pytest.mark.parametrize("core", CORES)
 def test_a_board_computes_the_same_bits_in_time(core: str, tmp_path: Path) -> None:
-    fpu, board, code, data = CORES[core]
-    source, native, target = HERE / "board_loop_program.cpp", tmp_path / "native", tmp_path / core
-    subprocess.run([str(COMPILER), *FLAGS, str(source), "-o", str(native)], check=True)
-    own = ["-fno-exceptions", "-fno-rtti", "-fno-threadsafe-statics", "-nostartfiles"]
-    own += [f"-mcpu={core}", "-mthumb", "-mfloat-abi=hard", f"-mfpu={fpu}"]
-    own += ["-T", str(HERE / "board_loop.ld"), f"-Wl,--defsym=CODE={code}"]
-    own += [f"-Wl,--defsym=DATA={data}", str(source), "-o", str(target)]
-    subprocess.run([str(CROSS), *FLAGS, *own], check=True)
-    expected = subprocess.run([str(native)], check=True, capture_output=True, text=True).stdout
-    emulate = [str(EMULATOR), "-M", board, "-icount", "shift=0", "-nographic", "-kernel"]
-    emulate += [str(target), "-semihosting-config", "enable=on,target=native"]
-    done = subprocess.run(emulate, check=True, capture_output=True, text=True, timeout=120.0)
-    emulated = told(done.stdout + done.stderr)
-    assert emulated | told(expected) == emulated
+    emulated = computed_on(core, tmp_path)
+    assert emulated | computed_here(tmp_path) == emulated
     assert 100 < emulated["instructions, mean"] < emulated["instructions, most"] <= MOST
+    flash, memory = memory_on(core, tmp_path)
+    assert 4000 < flash < 16_000
+    assert 300 < memory < 4000
+
+
+def test_the_script_says_what_to_install_where_a_tool_is_missing(tmp_path: Path) -> None:
+    script = HERE.parent / "scripts" / "test_firmware"
+    empty = {"PATH": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, str(script)], check=False, capture_output=True, text=True, env=empty
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "on Debian: apt install g++ gcc-arm-none-eabi" in done.stderr

@@ -7,6 +7,7 @@ import math
 import re
 import shutil
 import struct
+import subprocess
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hapticbridge.device.base import AXES
-from hapticbridge.device.own_loop import BoardSetting, ShownTool
+from hapticbridge.device.own_loop import BoardSetting, LoopReport, LoopState, ShownTool
 from hapticbridge.device.rawhid import device as driver
 from hapticbridge.device.rawhid import protocol
 
@@ -354,22 +355,30 @@ def test_the_firmware_has_a_grip_axis_where_its_sheet_says_so(shim: ctypes.CDLL)
 
 
 @pytest.fixture(scope="module")
-def sketch_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("sketch")
-    (folder / "Encoder.h").write_text(
-        "struct Encoder { Encoder(int, int) {} void write(int) {}\n"
-        "                 int read() { return encoder_count; } };\n"
-    )
-    built(folder, f'-DSKETCH="{FIRMWARE / "hapticbridge_rawhid.ino"}"')
-    return folder / LIBRARY
+def sketch_files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Libraries of both sketches, by the link that they use."""
+    files = {}
+    for link in ("rawhid", "serial"):
+        folder = tmp_path_factory.mktemp(link)
+        (folder / "Encoder.h").write_text(
+            "struct Encoder { Encoder(int, int) {} int read() { return encoder_count; } };\n"
+        )
+        name = FIRMWARE / f"hapticbridge_{link}.ino"
+        built(folder, f'-DSKETCH="{name}"', "-DTEENSYDUINO")
+        files[link] = folder / LIBRARY
+    return files
+
+
+def switched_on(file: Path, folder: Path) -> ctypes.CDLL:
+    """A sketch of the test's own at time 0: a copy of the file has variables of its own."""
+    sketch = ctypes.CDLL(str(shutil.copy(file, folder)))
+    sketch.sketch_setup()
+    return sketch
 
 
 @pytest.fixture
-def sketch(sketch_file: Path, tmp_path: Path) -> ctypes.CDLL:
-    """A sketch of the test's own at time 0: a copy of the file has variables of its own."""
-    switched_on = ctypes.CDLL(str(shutil.copy(sketch_file, tmp_path)))
-    switched_on.sketch_setup()
-    return switched_on
+def sketch(sketch_files: dict[str, Path], tmp_path: Path) -> ctypes.CDLL:
+    return switched_on(sketch_files["rawhid"], tmp_path)
 
 
 def states_of(sketch: ctypes.CDLL) -> list[protocol.State]:
@@ -406,26 +415,87 @@ def test_the_sketch_pushes_as_told_and_its_interrupt_lets_go(sketch: ctypes.CDLL
     assert sketch.sketch_pin(PWM) == 0
 
 
-def test_the_sketch_renders_a_wall_by_itself(sketch: ctypes.CDLL) -> None:
-    sketch.sketch_send(protocol.setting_frame(1, BoardSetting(5e3, 0.0, 2.0, 0.0, 0.01)))
+def turn(sketch: ctypes.CDLL, link: str, steps: int) -> float:
+    """Turns the motor from its start; returns the handle's way in m."""
+    if link == "rawhid":
+        sketch.sketch_turn(steps)
+    else:
+        sketch.sketch_sense(500 + steps)
+    return steps / (2000 if link == "rawhid" else 1960) * 2.0 * math.pi * TRAVEL
+
+
+def hand_over(sketch: ctypes.CDLL, link: str, frame: bytes) -> None:
+    if link == "rawhid":
+        sketch.sketch_send(frame)
+    else:
+        sketch.sketch_line(frame, len(frame))
+
+
+TRAVEL = 0.070 * 0.005 / 0.075
+"""Way of the handle in m per rad of the motor."""
+
+
+@pytest.mark.parametrize(("link", "whole"), [("rawhid", 1023), ("serial", 255)])
+def test_a_sketch_renders_a_wall_by_itself(
+    sketch_files: dict[str, Path], tmp_path: Path, link: str, whole: int
+) -> None:
+    sketch = switched_on(sketch_files[link], tmp_path)
+    setting = BoardSetting(5e3, 0.0, 2.0, 0.0, 0.01)
+    hand_over(sketch, link, protocol.setting_frame(1, setting))
     wall = (((1.0, 0.0, 0.0), 0.0),)
     for sequence in range(2, 7):
         tool = ShownTool((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, wall)
-        sketch.sketch_send(protocol.show_frames(sequence, tool, 50)[0])
+        hand_over(sketch, link, protocol.show_frames(sequence, tool, 50)[0])
         sketch.sketch_run(10_000, 1)
-        sketch.sketch_turn(-10 * (sequence > 3))
-    force = 5e3 * 10 * 0.070 * 0.005 / 0.075 * 2.0 * math.pi / 2000
-    duty = force * 0.070 * 0.005 / 0.075 / 0.0136 * 2.5 / 12.0
-    assert sketch.sketch_pin(PWM) == pytest.approx(1023 * duty, abs=1)
+        depth = turn(sketch, link, -10 * (sequence > 3))
+    duty = -5e3 * depth * TRAVEL / 0.0136 * 2.5 / 12.0
+    assert sketch.sketch_pin(PWM) == pytest.approx(whole * duty, abs=1)
     assert sketch.sketch_pin(DIRECTION) == 1
     sketch.sketch_run(35_000, 0)  # loop() hangs: the interrupt renders it until patience ends
-    assert sketch.sketch_pin(PWM) == pytest.approx(1023 * duty, abs=1)
+    assert sketch.sketch_pin(PWM) == pytest.approx(whole * duty, abs=1)
     sketch.sketch_run(25_000, 0)
     assert sketch.sketch_pin(PWM) == 0
+
+
+def test_the_serial_sketch_tells_of_its_loop_and_never_waits(
+    sketch_files: dict[str, Path], tmp_path: Path
+) -> None:
+    sketch = switched_on(sketch_files["serial"], tmp_path)
+    tool = ShownTool((0.0,) * 3)
+    for frame in (protocol.ask_frame(1, 0), protocol.show_frames(2, tool, 50)[0]):
+        sketch.sketch_line(frame, 64)
+    sketch.sketch_run(101_000, 1)
+    data = ctypes.create_string_buffer(1 << 14)
+    count = sketch.sketch_take(data, len(data))
+    frames = protocol.FrameReader().take(data.raw[:count])
+    told = [protocol.decoded(frame) for frame in frames]
+    sheet = next(each for each in told if isinstance(each, protocol.Numbers))
+    assert (sheet.loop_rate, sheet.loop_delay) == pytest.approx((10e3, 140e-6))
+    loops = [each for each in told if isinstance(each, LoopState)]
+    reports = [each for each in told if isinstance(each, LoopReport)]
+    assert len(loops) + len(reports) >= 95  # a frame in each millisecond, from the second on
+    assert reports[-1].ticks > 900
+    assert {each.missed for each in reports} == {0}
+    assert sketch.sketch_overrun() == 0  # Serial never got a byte that it had no room for
+
+
+TIMER = "void hb_start_timer(void (*tick)(), uint32_t) { (void)tick; }"
+
+
+def test_a_board_whose_timer_is_unknown_is_refused_by_the_compiler(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    name = f'-DSKETCH="{FIRMWARE / "hapticbridge_serial.ino"}"'
+    with pytest.raises(subprocess.CalledProcessError):
+        built(tmp_path, name)
+    assert "define HB_OWN_TIMER and hb_start_timer()" in capfd.readouterr().err
+    own = tmp_path / "own.ino"
+    own.write_text(f'#include "{FIRMWARE / "hapticbridge_serial.ino"}"\n{TIMER}\n')
+    assert built(tmp_path, f'-DSKETCH="{own}"', "-DHB_OWN_TIMER")
 
 
 def test_what_the_sketch_does_with_interrupts_off_keeps_them_off(sketch: ctypes.CDLL) -> None:
     sketch.sketch_send(protocol.force_frame(1, WRENCH, 20))
     sketch.sketch_run(1_010 * 3 + 10, 1)
-    assert sketch.sketch_sections() == 7  # a force frame, and two for each of three states
+    assert sketch.sketch_sections() == 10  # a force frame, and three for each of three states
     assert sketch.sketch_broken_sections() == 0

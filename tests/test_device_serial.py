@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import errno
 import importlib
+import itertools
 import os
 import pty
 import threading
@@ -27,6 +28,7 @@ from hypothesis import strategies as st
 
 from hapticbridge.device import SimulatedDevice, open_device
 from hapticbridge.device.driver import ignore_message
+from hapticbridge.device.own_loop import BoardSetting, ShownTool
 from hapticbridge.device.rawhid import protocol
 from hapticbridge.device.rawhid.device import RawHidDevice
 from hapticbridge.device.rawhid.serial import BAUDS, SystemPorts, open_serial
@@ -388,22 +390,32 @@ class Board:
             os.close(self._master)
 
 
-@pytest.fixture(name="board")
-def _board(tmp_path: Path) -> Iterator[Board]:
+def switched_on(folder: Path, option: str) -> Iterator[Board]:
+    """The sketch for a processor of Arduino's or a Teensy's name."""
     if COMPILER is None:
         pytest.skip("neither g++ nor clang++ is here to compile the firmware with")
-    (tmp_path / "avr").mkdir()
-    (tmp_path / "avr/wdt.h").write_text(
+    (folder / "avr").mkdir()
+    (folder / "avr/wdt.h").write_text(
         "enum { WDTO_15MS };\nstatic int fed = 0;\n"
         "static void wdt_enable(int) { fed = 1; }\nstatic void wdt_reset() { fed++; }\n"
         'extern "C" int sketch_fed() { return fed; }\n'
     )
     name = FIRMWARE / "hapticbridge_serial.ino"
-    sketch = built(tmp_path, f'-DSKETCH="{name}"', "-D__AVR__")
+    sketch = built(folder, f'-DSKETCH="{name}"', option)
     sketch.sketch_setup()
     board = Board(sketch)
     yield board
     board.unplug()
+
+
+@pytest.fixture(name="board")
+def _board(tmp_path: Path) -> Iterator[Board]:
+    yield from switched_on(tmp_path, "-D__AVR__")
+
+
+@pytest.fixture(name="fast_board")
+def _fast_board(tmp_path: Path) -> Iterator[Board]:
+    yield from switched_on(tmp_path, "-DTEENSYDUINO")
 
 
 def until(condition: Any) -> None:
@@ -453,6 +465,33 @@ def test_the_hapkit_sketch_runs_behind_pyserial_and_lets_go_by_itself(board: Boa
     assert board.sketch.sketch_pin(DIRECTION) == 0
     assert board.sketch.sketch_fed() > 1
     until(lambda: board.sketch.sketch_pin(PWM) == 0)  # nothing is written: its watchdog
+    device.close()
+
+
+def test_a_board_with_a_loop_renders_a_wall_behind_pyserial(fast_board: Board) -> None:
+    device = open_serial({"port": fast_board.path}, ignore_message, SlowClock())
+    sample = np.zeros(1, SAMPLE_DTYPE)
+    assert device.info.loop_period == pytest.approx(1e-4)
+    assert device.info.loop_delay == pytest.approx(140e-6)
+    device.start(1e-3)
+    wall = ShownTool((0.0,) * 3, (0.0,) * 3, 0.0, (((1.0, 0.0, 0.0), 0.0),))
+    calls = itertools.count()
+
+    def felt() -> float:
+        if next(calls) % 5:  # a frame that has not left is replaced by the next one
+            device.show(wall)
+        else:
+            device.set_loop(BoardSetting(5e3, 0.0, 2.0, 0.0, 0.01))
+        device.read(sample)
+        return 0.0 if device.loop_state is None else device.loop_state.force[0]
+
+    until(lambda: felt() == 0.0 and device.loop_report and device.loop_report.share == 1.0)
+    fast_board.sketch.sketch_sense(490)  # 10 of 1960 steps a turn
+    depth = 10 / 1960 * 2 * np.pi * 0.070 * 0.005 / 0.075
+    until(lambda: felt() == pytest.approx(5e3 * depth, rel=1e-3))
+    until(lambda: fast_board.sketch.sketch_pin(PWM) > 0)
+    assert fast_board.sketch.sketch_pin(DIRECTION) == 1
+    until(lambda: fast_board.sketch.sketch_pin(PWM) == 0)  # nothing is shown: its patience ends
     device.close()
 
 

@@ -19,6 +19,7 @@ TOPICS = {
     "How to": (
         "devices",
         "device-package",
+        "stiff-device",
         "coupling",
         "active-verdict",
         "missed-deadlines",

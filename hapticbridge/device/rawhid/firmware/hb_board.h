@@ -94,6 +94,13 @@ class HbBoard {
     for (int i = 0; i < 3; i++) force[i] = wrench.force[i];
   }
 
+  // Copies the position in m of the last period.
+  void latched(float position[3]) const {
+    HB_LOCK();
+    memcpy(position, loop_.report().position, 3 * sizeof(float));
+    HB_UNLOCK();
+  }
+
   // Temperature of the motors in degrees Celsius, for the host.
   void set_temperature(float temperature) { pace_.temperature = temperature; }
 

@@ -18,7 +18,7 @@
 // P in J is what the coupling gives to the tool in the period, W what the host's scene has taken of
 // it, and E a credit. The spring's energy V is convex in e, so the hand has put in at least
 // sum P + V on a device of b >= K T/2 + B, whatever the host shows, and however late. The time t from
-// reading a position to its force counts, too: without a damper b >= K (T/2 + t).
+// reading a position to its force counts, too: b >= K (T/2 + 3 t/2) + B is enough up to t = T.
 //
 // An HbLoop belongs to one interrupt. What a main loop receives for it is copied with interrupts off.
 //

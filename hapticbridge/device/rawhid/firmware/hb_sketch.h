@@ -1,0 +1,194 @@
+// What sketches have in common: a motor behind a PWM, the timer of the periods, and the pace of the
+// state frames. The sketch defines read_position() and write_force().
+//
+//   HbSketch device(sheet, 100);                 // period of the loop in us
+//   void control_tick() { device.tick(); }
+//   device.start(control_tick);                  // in setup()
+//   device.poll();                               // in loop()
+//   device.receive(frame);                       // or receive_byte(byte)
+//   if (device.answer(frame)) send(frame);
+//   if (device.state(buttons, status, frame)) send(frame);
+//
+// An AVR has no floating-point unit and is too slow for a loop of its own: it follows force frames
+// alone, loop() runs its periods, and its watchdog restarts a processor that hangs. On a Teensy an
+// IntervalTimer runs them. For another board define HB_OWN_TIMER and hb_start_timer().
+//
+// Licence: Apache-2.0, as the rest of hapticbridge.
+#ifndef HB_SKETCH_H
+#define HB_SKETCH_H
+
+#include "hb_board.h"
+
+// Reads the handle's position in m; axes that the device lacks stay 0. Called from the interrupt.
+void read_position(float position[3]);
+
+// Applies a force in N at the handle, zero where there is to be none. Called from the interrupt: it
+// must not wait, print or allocate.
+void write_force(const float force[3]);
+
+// Returns a sheet of which all is unknown, for a device without rotation and grip.
+inline HbSheet hb_unknown_sheet() {
+  HbSheet sheet;
+  memset(&sheet, 0, sizeof sheet);
+  sheet.mass = sheet.damping = sheet.friction = sheet.resolution = sheet.delay = NAN;
+  sheet.rotational_inertia = sheet.rotational_damping = sheet.torque_limit = NAN;
+  return sheet;
+}
+
+// Brushed motor behind a PWM without a current sensor: its force is that of the motor at rest.
+struct HbMotor {
+  float torque_constant;  // N m/A, the motor's data sheet
+  float resistance;       // ohm, winding, driver and wires together
+  float inductance;       // H, winding
+  float supply;           // V, at the driver
+  float duty_limit;       // of full PWM, 0 to 1; raise it when it has proved safe
+  float travel;           // m of handle per rad of the motor
+  volatile bool is_saturated;
+
+  // Returns the largest force in N at the handle.
+  float force_limit() const {
+    return duty_limit * supply / resistance * torque_constant / travel;
+  }
+
+  // Returns the share of full PWM for a force in N, within the limit; its sign is the force's.
+  float duty(float force) {
+    const float share = force / force_limit();
+    is_saturated = fabsf(share) > 1.0f;
+    return duty_limit * fmaxf(fminf(share, 1.0f), -1.0f);
+  }
+
+  // Returns the time in s in which the current follows the voltage. It counts as a delay.
+  float lag() const { return inductance / resistance; }
+
+  // Status bits of a state frame.
+  uint8_t status() const { return is_saturated ? HB_SATURATED : 0; }
+};
+
+#ifdef __AVR__
+
+#include <avr/wdt.h>
+
+static const bool HB_HAS_LOOP = false;
+
+class HbSketchBoard {
+ public:
+  HbSketchBoard(const HbSheet& sheet, uint32_t period_us)
+      : board_(sheet), period_us_(period_us), last_us_(0) {}
+
+  void start(void (*)()) { wdt_enable(WDTO_15MS); }
+
+  void poll() {
+    wdt_reset();
+    if (micros() - last_us_ < period_us_) return;
+    last_us_ = micros();
+    write_force(board_.wrench(last_us_).force);
+  }
+
+  void tick() {}
+
+ protected:
+  void latch(float position[3]) { read_position(position); }
+
+  HbDevice board_;
+
+ private:
+  const uint32_t period_us_;
+  uint32_t last_us_;
+};
+
+#else
+
+#ifdef TEENSYDUINO
+inline void hb_start_timer(void (*tick)(), uint32_t period_us) {
+  static IntervalTimer timer;
+  timer.begin(tick, period_us);
+}
+#elif defined(HB_OWN_TIMER)
+void hb_start_timer(void (*tick)(), uint32_t period_us);
+#else
+#error "define HB_OWN_TIMER and hb_start_timer(): 'hapticbridge guide stiff-device' has it for boards"
+#endif
+
+static const bool HB_HAS_LOOP = true;
+
+class HbSketchBoard {
+ public:
+  HbSketchBoard(const HbSheet& sheet, uint32_t period_us)
+      : board_(sheet, 1e-6f * (float)period_us), period_us_(period_us) {}
+
+  // Starts the periods.
+  void start(void (*tick)()) { hb_start_timer(tick, period_us_); }
+
+  // Runs what is due in loop().
+  void poll() {}
+
+  // Runs one period, in the timer's interrupt. It renders without loop(): if that hangs, no frame is
+  // received, and the patience or the watchdog of the last one ends the force here. A processor that
+  // has stopped keeps its PWM: drive an enable input of the driver by a hardware watchdog.
+  void tick() {
+    float position[3] = {0.0f, 0.0f, 0.0f}, force[3];
+    read_position(position);
+    board_.tick(position, micros(), force);
+    write_force(force);
+  }
+
+ protected:
+  // Reads the newest position in m.
+  void latch(float position[3]) { board_.latched(position); }
+
+  HbBoard board_;
+
+ private:
+  const uint32_t period_us_;
+};
+
+#endif
+
+// A device with the pace of its state frames and the speed in them.
+class HbSketch : public HbSketchBoard {
+ public:
+  // Creates a device without a force; states are sent at the sheet's rate.
+  HbSketch(const HbSheet& sheet, uint32_t period_us)
+      : HbSketchBoard(sheet, period_us),
+        state_period_us_((uint32_t)(1e6f / sheet.rate + 0.5f)),
+        due_us_(0),
+        last_us_(0) {
+    memset(last_, 0, sizeof last_);
+  }
+
+  // Takes one report from the host.
+  void receive(const uint8_t frame[HB_FRAME_BYTES]) { board_.receive(frame, micros()); }
+
+  // Takes one byte from the host on a serial line.
+  void receive_byte(uint8_t byte) { board_.receive_byte(byte, micros()); }
+
+  // Fills in the requested page of the sheet; returns false without a request.
+  bool answer(uint8_t frame[HB_FRAME_BYTES]) { return board_.answer(frame); }
+
+  // Fills in a state frame, once per period; returns false before.
+  bool state(uint16_t buttons, uint8_t status, uint8_t frame[HB_FRAME_BYTES]) {
+    const uint32_t now_us = micros();
+    if (now_us - due_us_ < state_period_us_) return false;
+    due_us_ += state_period_us_;
+    if (now_us - due_us_ >= state_period_us_) due_us_ = now_us;  // late: not a burst to catch up
+    HbMotion motion;
+    memset(&motion, 0, sizeof motion);
+    latch(motion.position);
+    for (int i = 0; i < 3; i++) {
+      motion.velocity[i] = (motion.position[i] - last_[i]) / (1e-6f * (float)(now_us - last_us_));
+      last_[i] = motion.position[i];
+    }
+    last_us_ = now_us;
+    motion.buttons = buttons;
+    motion.status = status;
+    board_.state(motion, now_us, frame);
+    return true;
+  }
+
+ private:
+  const uint32_t state_period_us_;
+  uint32_t due_us_, last_us_;
+  float last_[3];
+};
+
+#endif
