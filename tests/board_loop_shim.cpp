@@ -164,6 +164,12 @@ HbBoard* board_new(int axes, float period, const float* numbers) {
   sheet.speed_limit = numbers[4];
   sheet.mass = numbers[5];
   sheet.torque_limit = sheet.rotational_damping = sheet.rotational_inertia = NAN;
+  if ((axes & (HB_X | HB_Y | HB_Z)) == 0) {
+    sheet.rotational_damping = sheet.damping;
+    sheet.rotational_inertia = sheet.mass;
+    sheet.torque_limit = sheet.force_limit;
+    sheet.damping = sheet.mass = sheet.friction = sheet.resolution = sheet.force_limit = NAN;
+  }
   sheet.delay = period;
   sheet.loop_delay = 1e-5f;
   sheet.name = "board";
@@ -183,6 +189,7 @@ void board_state(HbBoard* board, const float* position, int status, unsigned now
   HbMotion motion;
   memset(&motion, 0, sizeof motion);
   memcpy(motion.position, position, 12);
+  if (board->turns()) memcpy(motion.rotation, position, 12);
   motion.status = (uint8_t)status;
   board->state(motion, now_us, frame);
 }

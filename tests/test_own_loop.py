@@ -15,7 +15,7 @@ from firmware_build import COMPILER
 
 import hapticbridge as hb
 from hapticbridge.demand.own_loop import REPORT_DTYPE, ROUNDING, OwnLoopTally
-from hapticbridge.device import SimulatedDevice
+from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
 from hapticbridge.device.simulated.device import hand_for
@@ -136,6 +136,41 @@ def test_a_scene_may_be_scaled_turned_and_slow(library: ctypes.CDLL, tmp_path: P
     assert hb.audit(path, in_process=True).verdict == "passive"
 
 
+KNOB = """<mujoco><worldbody><body><joint type="hinge" axis="0 0 1" range="-20 20" limited="true"/>
+<geom type="cylinder" size=".03 .01" mass=".1"/><site name="grip"/></body></worldbody></mujoco>"""
+
+
+def test_a_knob_feels_the_stop_of_a_hinge(library: ctypes.CDLL, tmp_path: Path) -> None:
+    """A device that only turns: 1 mN m s/rad, 10 kHz, a stop at 20 degrees."""
+    (tmp_path / "knob.xml").write_text(KNOB)
+    times = np.linspace(0.0, 3.0, 301)
+    half = 0.5 * 0.6 * np.sin(np.pi * np.clip(times / 3.0, 0.0, 1.0)) ** 2
+    table = np.column_stack(
+        [times, np.zeros((301, 3)), np.cos(half), np.zeros((301, 2)), np.sin(half)]
+    )
+    sheet = BoardSheet(axes=0b100000, damping=1e-3, friction=0.0, resolution=0.0, force_limit=0.05)
+    mechanics = SimulatedDevice(
+        rotational_inertia=1e-5,
+        rotational_damping=1e-3,
+        path=Motion(times, table[:, 1:4], table[:, 4:]),
+    )
+    board = LoopBoard(library, mechanics, sheet, 0.5e-3)
+    seam, path = HidSeam(board), tmp_path / "run.mcap"
+    device = open_rawhid({}, ignore_message, seam, lambda: seam.now)
+    assert (device.info.axes, device.info.loop_period) == (("rz",), 1e-4)
+    clock = DrivingClock(seam)
+    with hb.Bridge(tmp_path / "knob.xml", device, clock=clock, recording=path) as bridge:
+        summary = bridge.run(1.6)
+        ticks = bridge.latest_records(800)
+    stiffness = bridge.setup.law.rotational_stiffness
+    assert stiffness > 5.0  # 0.4 behind the link
+    deepest = ticks[np.argmax(np.abs(ticks["wrench_on_device"][:, 5]))]
+    assert -deepest["wrench_on_device"][5] == pytest.approx(0.05, rel=1e-3)
+    assert summary.is_certified
+    assert board.work - board.burned < ROUNDING
+    assert hb.audit(path, in_process=True).verdict == "passive"
+
+
 def test_a_recorded_run_repeats_to_the_bit_with_commands(
     library: ctypes.CDLL, tmp_path: Path
 ) -> None:
@@ -218,7 +253,7 @@ def test_what_a_board_cannot_have_is_left_to_the_bridge(library: ctypes.CDLL) ->
 
 
 def test_another_run_on_the_same_board_begins_anew(library: ctypes.CDLL, tmp_path: Path) -> None:
-    """What the scene of the last run took or released is nothing to the next one."""
+    """The next run owes nothing for what the scene of the last one took or released."""
     bench = Bench(library, "screwdriver")
     with bench.bridge() as bridge:
         bridge.run(1.0)

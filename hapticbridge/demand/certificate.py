@@ -98,8 +98,12 @@ def default_coupling(
     own, own_period = pulling_loop(info, period)
     lag = assumed_lag(own, own_period)
     if info.loop_period is not None:
-        needed = required_damping(Coupling(1.0, 0.0, 0.0, 0.0), own_period, lag=lag)
-        coupling = replace(coupling, stiffness=NEEDED_SHARE * damping / needed, damping=0.0)
+        share = NEEDED_SHARE / required_damping(Coupling(1.0, 0.0), own_period, lag=lag)
+        coupling = (
+            replace(coupling, stiffness=share * damping, damping=0.0)
+            if info.moves
+            else replace(coupling, rotational_stiffness=share * rotational, rotational_damping=0.0)
+        )
     elif lag != IN_TIME:
         linear = stiffest_late_coupling(damping, period, lag.delay, lag.ticks_per_sample)
         coupling = replace(coupling, stiffness=linear[0], damping=linear[1])
@@ -519,7 +523,8 @@ def run_conditions(
         return ()
     conditions = conditions_of(LoopSetting.of_run(info, parameters, method))
     guard, ratio = parameters.guarding, parameters.force_scale / parameters.scale
-    is_whole = method.scheme == Scheme.MIDPOINT and guard.has_hand and not parameters.scene_ticks
+    is_beside = parameters.scene_ticks > 0 or parameters.is_apart
+    is_whole = method.scheme == Scheme.MIDPOINT and guard.has_hand and not is_beside
     if not (is_whole and info.turns and guard.twist_damping == math.inf):
         return conditions
     law, period, twist = parameters.coupling, parameters.period, min(guard.angle, math.pi)

@@ -162,7 +162,7 @@ class Certification:
     @property
     def _bound(self) -> str:
         if any(each.loop_period for each in self.conditions):
-            return "K(T/2 + t) + B_law in its own loop"
+            return "K(T + 3t)/2 + B_law in its own loop"
         samples = max((each.ticks_per_sample for each in self.conditions), default=1)
         if samples > 1:
             return f"what one sample in {samples} ticks needs"

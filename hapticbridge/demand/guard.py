@@ -318,7 +318,7 @@ def button_mask(button: int | None) -> int:
 
 def _twist_damping(info: DeviceInfo, period: float) -> float:
     """Returns ``GuardParameters.twist_damping`` of a device with a hand."""
-    if not info.turns:
+    if not info.turns or info.loop_period is not None:
         return math.inf
     is_in_time = Lag.of(info, period) == IN_TIME
     return (info.rotational_damping or 0.0) if is_in_time else 0.0

@@ -6,7 +6,7 @@
     the scene's coupling pulls at its tool ◀──    STATE: h, the force, Σ P, D
 
 The link is outside the board's loop, so its delay costs no stiffness: the condition on the device
-is b >= K (T_b/2 + t) + B', with t from reading a position to its force. ``rawhid.md`` has the
+is b >= K (T_b/2 + 3t/2) + B', with t from reading a position to its force. ``rawhid.md`` has the
 board's side of it.
 """
 
@@ -28,7 +28,7 @@ class LoopState(NamedTuple):
         status, sequence, buttons, time_us, echo: As of ``State``; the echo is that of the newest
             shown tool.
         position, velocity, force: Handle in m and m/s and the force on it in N, in the device's
-            frame.
+            frame; of a device that only turns in rad, rad/s and N m.
         passed: Σ P, what the coupling has given to the shown tool, in J.
         tank: D, what the shown tool may still give, in J.
     """
@@ -130,10 +130,12 @@ class LoopDevice(Device, Protocol):
     It follows ``write`` until the first ``show``, and again from the next ``write`` on.
 
     Attributes:
+        place: Newest position in m, or angles in rad of a device that only turns.
         loop_state: Its newest state in the loop; None before the first.
         loop_report: Newest counters of its loop; None before the first.
     """
 
+    place: tuple[float, ...]
     loop_state: LoopState | None
     loop_report: LoopReport | None
 

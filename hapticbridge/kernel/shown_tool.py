@@ -375,9 +375,10 @@ def shown_to_device(state: NDArray[np.void], lead: float, numbers: NDArray[np.fl
     Args:
         state: The bound state.
         lead: Time in s by which the tool is foreseen: from the sample to its coming to the device.
-        numbers: Receives, in the device's frame, position in m and velocity in m/s, the work W that
-            the scene has taken in J at the hand, and per surface its normal and gap in m, the
-            nearest surfaces first.
+        numbers: Receives, in the device's frame, the way from the handle to the tool in m and its
+            velocity in m/s, the work W that the scene has taken in J at the hand, and per surface
+            its normal and gap in m, the nearest surfaces first. For a device that only turns they
+            are in rad and rad/s, without surfaces.
 
     Returns:
         The number of surfaces.
@@ -388,15 +389,21 @@ def shown_to_device(state: NDArray[np.void], lead: float, numbers: NDArray[np.fl
     store_vector(shown.newest[0:3], tool)
     store_quaternion(shown.newest[3:7], turn)
     _take_planes(s, s)
+    numbers[6] = run.force_scale / run.scale * s.energy.coupling_work
+    lacks = s.coupling.lacks_motor
+    if lacks[0] + lacks[1] + lacks[2] == 3.0:
+        velocity = scaled(1.0 / run.period, vector_of(s.loop.motion[3:6]))
+        twist = rotation_between(quaternion_of(pose.handle_quaternion), turn)
+        ahead = scaled(lead, velocity)
+        store_vector(numbers[0:3], device_from_scene(run.axes, add(twist, ahead)))
+        store_vector(numbers[3:6], device_from_scene(run.axes, velocity))
+        return 0
     velocity = scaled(1.0 / run.period, vector_of(s.loop.motion))
     ahead = scaled(lead, velocity)
-    handle = vector_of(pose.handle_position)
-    stretch = scaled(1.0 / run.scale, add(subtract(tool, handle), ahead))
-    store_vector(
-        numbers[0:3], add(vector_of(pose.device_position), device_from_scene(run.axes, stretch))
-    )
-    store_vector(numbers[3:6], device_from_scene(run.axes, scaled(1.0 / run.scale, velocity)))
-    numbers[6] = run.force_scale / run.scale * s.energy.coupling_work
+    stretch = add(subtract(tool, vector_of(pose.handle_position)), ahead)
+    scale = 1.0 / run.scale
+    store_vector(numbers[0:3], device_from_scene(run.axes, scaled(scale, stretch)))
+    store_vector(numbers[3:6], device_from_scene(run.axes, scaled(scale, velocity)))
     moved = add(subtract(tool, vector_of(shown.before)), ahead)
     # several contacts of one face are one surface to a tool that moves along lines
     turned = rotation_between(quaternion_of(shown.before[3:7]), turn)

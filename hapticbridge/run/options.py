@@ -375,7 +375,7 @@ def _usual_coupling(
     law = method.law_coupling(usual, period)
     share = min(steady_stiffness(scene, info, foreseen, *scales) / law.stiffness, 1.0)
     turned = min(
-        share * law.rotational_stiffness,
+        (share if info.moves else 1.0) * law.rotational_stiffness,
         steady_rotational_stiffness(info, foreseen, *scales),
     )
     law = replace(law, stiffness=share * law.stiffness, rotational_stiffness=turned)

@@ -20,11 +20,13 @@ from hapticbridge.demand.own_loop import COUNTERS, REPORT_DTYPE, OwnLoopTally
 from hapticbridge.device.own_loop import SURFACES, BoardSetting, LoopDevice, ShownTool
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.shown_tool import FASTEST, shown_to_device
+from hapticbridge.kernel.shown_tool import FASTEST, FASTEST_TURN, shown_to_device
 from hapticbridge.kernel.state import BoundKernel
 
 AGILITY = 0.05
 """Share of a new measurement of the delay that is taken over at once, without unit."""
+
+_LINES, _TURNS = ("stiffness", "damping"), ("rotational_stiffness", "rotational_damping")
 
 _REMEMBERED = 256
 """Shown tools whose work is kept until the device has answered them."""
@@ -50,14 +52,21 @@ class OwnLoop:
         self._parameters = parameters
         self._numbers = np.zeros(7 + 4 * SURFACES)
         self._lead = lead = device.info.delay or 0.0  # to the coming of what answers a sample
-        self._passing = 2.0 * parameters.force_limit * FASTEST * (parameters.period + lead)
+        self._turns = not device.info.moves
+        self._part = slice(3, 6) if self._turns else slice(0, 3)
+        self._limit, fastest = parameters.force_limit, FASTEST
+        self._ratio, self._names = parameters.scale * parameters.force_scale, _LINES
+        if self._turns:
+            self._limit, fastest = parameters.torque_limit, FASTEST_TURN
+            self._ratio, self._names = parameters.force_scale / parameters.scale, _TURNS
+        self._passing = 2.0 * self._limit * fastest * (parameters.period + lead)
         self._show = direct(shown_to_device, bound.state, lead, self._numbers)
         loop, guard = bound.state["loop"], bound.state["guard"]
         self._reported, self._tick = loop["reported"][0], loop["tick"]
         self._lever, self._cap = guard["lever"], bound.state["watch"]["max_lever"]
         self._coupling, self._level = bound.state["coupling"], bound.state["level"]["level"][0]
         self._told: tuple[float, ...] = ()
-        self._told_tick, self._is_followed = 0, False
+        self._told_tick, self._is_followed, self._last_lever = 0, False, 0.0
         self._works, self._sent = np.zeros(_REMEMBERED), np.full(_REMEMBERED, -1, np.int64)
         self._reports: list[tuple[int, float, float, float]] = []
         self.tally = OwnLoopTally.begin(parameters.loop_period, parameters.guarding.resolution)
@@ -69,7 +78,7 @@ class OwnLoop:
         if state is None:  # it follows no tool yet, and has no force
             self._reported[:] = 0.0
             return flags
-        self._reported[:3], self._is_followed = state.force, True
+        self._reported[self._part], self._is_followed = state.force, True
         place, tick = state.echo % _REMEMBERED, int(self._tick[0])
         self._reports.append((tick, float(self._works[place]), state.passed, state.tank))
         if self._sent[place] >= 0 and not flags:
@@ -81,21 +90,28 @@ class OwnLoop:
         """Shows the tool of the step that just ended, in the place of ``Device.write``."""
         self._tell()
         count = self._show(self._state, self._lead, self._numbers)
-        x, y, z, vx, vy, vz, work, *planes = self._numbers.tolist()
+        dx, dy, dz, vx, vy, vz, work, *planes = self._numbers.tolist()
+        x, y, z = self._device.place
         surfaces = tuple(
             ((nx, ny, nz), gap)
             for nx, ny, nz, gap in zip(*[iter(planes[: 4 * count])] * 4, strict=True)
         )
         shown = ShownTool(
-            (x, y, z),
+            (x + dx, y + dy, z + dz),
             (vx, vy, vz),
             work,
             surfaces,
             is_placed=not self._is_followed,
-            is_enabled=bool(self._lever[0] > 0.0),
+            is_enabled=self._is_on(),
         )
         place = self._device.show(shown) % _REMEMBERED
         self._works[place], self._sent[place] = work, self._tick[0]
+
+    def _is_on(self) -> bool:
+        """Returns False while the lever falls, which the device's own fade then follows."""
+        lever, last = float(self._lever[0]), self._last_lever
+        self._last_lever = lever
+        return lever > 0.0 and not (lever < last and lever < self._cap[0])
 
     def _tell(self) -> None:
         """Tells the device its coupling, when that changes and now and then."""
@@ -110,13 +126,12 @@ class OwnLoop:
         own, coupling = self._parameters, self._coupling
         gains = coupling["tuning_goal"] if coupling["tuning_ticks"][0] else coupling
         cap = float(self._cap[0])
-        ratio = own.scale * own.force_scale * cap * cap
-        force = cap * own.force_limit
+        stiffness, damping = (float(gains[name][0]) for name in self._names)
         is_risen = self._lever[0] >= cap
         return BoardSetting(
-            stiffness=ratio * float(gains["stiffness"][0]),
-            damping=ratio * float(gains["damping"][0]),
-            level=force,
+            stiffness=self._ratio * cap * cap * stiffness,
+            damping=self._ratio * cap * cap * damping,
+            level=cap * self._limit,
             passing=cap * self._passing,
             fade=own.period * (own.guarding.fade_ticks if is_risen else max(own.ramp_ticks, 1)),
         )

@@ -22,7 +22,7 @@ STATE_PERIOD = 1.01e-3
 class BoardSheet:
     """Data sheet of a board: axes as bits, and numbers in SI units."""
 
-    axes: int = 0b111
+    axes: int = 0b111  # beyond 0b111 damping, friction, step and limit are those of rotation
     period: float = 1e-4
     damping: float = 2.0
     friction: float = 0.1
@@ -62,6 +62,7 @@ class LoopBoard(HidDevice):
         super().__init__()
         self.sheet, self._library, self._link = sheet or BoardSheet(), library, link
         own = self.sheet
+        self._turns = own.axes & 0b111 == 0
         numbers = [own.damping, own.friction, own.resolution]
         numbers += [own.force_limit, own.speed_limit, own.mass]
         new = library.board_new(own.axes, ctypes.c_float(own.period), floats(numbers))
@@ -100,19 +101,27 @@ class LoopBoard(HidDevice):
         self._to_board.append((now + self._link, report))
 
     def _read(self) -> NDArray[np.float32]:
-        position, step = self._sample["position"][0], self.sheet.resolution
+        position, step = self._place(), self.sheet.resolution
         read = step * np.round(position / step) if step else position
         return np.asarray(read, np.float32)
 
+    def _place(self) -> NDArray[np.float64]:
+        """Returns the position in m, or the rotation vector in rad of a device that only turns."""
+        if not self._turns:
+            return np.array(self._sample["position"][0])
+        w, *axis = self._sample["quaternion"][0]
+        size = float(np.linalg.norm(axis))
+        return np.array(axis) * (2.0 * np.arctan2(size, w) / size if size else 2.0)
+
     def _tick(self, due: float) -> None:
-        before = self._sample["position"][0].copy()
+        before = self._place()
         if not self.skip_every or self._ticks % self.skip_every:
             own = self._board, floats(self._read()), _us(due), floats(self.force)
             self._library.board_tick(*own)
-        self._sent[:3] = self.force
+        self._sent[3 * self._turns : 3 + 3 * self._turns] = self.force
         self._mechanics.write(self._sent)
         self._mechanics.read(self._sample)
-        moved = self._sample["position"][0] - before
+        moved = self._place() - before
         self.work += float(self.force @ moved)
         self.burned += self.sheet.damping / self.sheet.period * float(moved @ moved)
 

@@ -195,8 +195,8 @@ def data_sheet(
 def _own_loop(
     rate: float | None, delay: float | None, axes: tuple[str, ...], *, has_grip: bool
 ) -> dict[str, float | None]:
-    """Returns period and delay of a board's own loop, which moves a handle along lines alone."""
-    if not rate or has_grip or not set(axes) <= set(AXES[:3]):
+    """Returns period and delay of a board's own loop, for a handle on lines or about one axis."""
+    if not rate or has_grip or not (set(axes) <= set(AXES[:3]) or len(axes) == 1):
         return {"loop_period": None, "loop_delay": 0.0}
     return {"loop_period": 1.0 / rate, "loop_delay": delay or 0.0}
 
@@ -397,6 +397,15 @@ class RawHidDevice:
         return state if isinstance(state, LoopState) else None
 
     @property
+    def place(self) -> tuple[float, ...]:
+        """Newest position in m, or angles in rad of a device that only turns."""
+        state = self.states.newest
+        if state is None:
+            return (0.0, 0.0, 0.0)
+        is_turned = isinstance(state, State) and not self.info.moves
+        return state.numbers[3:6] if is_turned else state.numbers[:3]
+
+    @property
     def loop_report(self) -> LoopReport | None:
         """Newest counters of its own loop; None before the first."""
         return self.states.report
@@ -425,7 +434,7 @@ class RawHidDevice:
     def velocity(self) -> NDArray[np.float64]:
         """Last reported velocity in m/s and angular velocity in rad/s, shape (6,); initially 0."""
         state = self.states.newest
-        numbers = (0.0,) * 12 if state is None else state.numbers
+        numbers = (0.0,) * 12 if state is None else self._in_place(state)
         moving: NDArray[np.float64] = np.array(numbers[6:]) * self._mask
         if self._has_grip:  # which is in its place
             moving[3:] = 0.0
@@ -447,7 +456,7 @@ class RawHidDevice:
 
     def _fill(self, state: State | LoopState) -> None:
         """Converts a state into a sample; axes that the device lacks do not move."""
-        pose = self._mask * state.numbers[:6]
+        pose = self._mask * self._in_place(state)[:6]
         sample = self._sample[0]
         sample["position"] = pose[:3]
         x, y, z = pose[3:].tolist()
@@ -455,6 +464,12 @@ class RawHidDevice:
         sample["buttons"] = state.buttons
         if self._has_grip:
             self._sample["position"][1, 0] = state.numbers[9]
+
+    def _in_place(self, state: State | LoopState) -> tuple[float, ...]:
+        """Returns the numbers of a state; a loop's own are angles on a device that only turns."""
+        if isinstance(state, State) or self.info.moves:
+            return state.numbers
+        return (*state.numbers[3:6], *state.position, *state.numbers[3:6], *state.velocity)
 
     def _next(self) -> int:
         self._sequence = (self._sequence + 1) & 0xFFFF

@@ -79,7 +79,8 @@ class HbBoard {
     }
   }
 
-  // Runs one period, in the timer's interrupt: `position` of the handle in m to `force` in N.
+  // Runs one period, in the timer's interrupt: `position` of the handle in m to `force` in N, or angles
+  // in rad to torques in N m of a device that only turns.
   void tick(const float position[3], uint32_t now_us, float force[3]) {
     const uint32_t since = now_us - last_us_;
     if (pace_.ticks > 0 && since > period_us_ + period_us_ / 2) {
@@ -91,10 +92,13 @@ class HbBoard {
     loop_.tick(position, force);
     if (is_loop_) return;
     const HbWrench wrench = command_.wrench(now_us);
-    for (int i = 0; i < 3; i++) force[i] = wrench.force[i];
+    memcpy(force, device_.turns() ? wrench.torque : wrench.force, 3 * sizeof(float));
   }
 
-  // Copies the position in m of the last period.
+  // True if the device only turns.
+  bool turns() const { return device_.turns(); }
+
+  // Copies the position of the last period.
   void latched(float position[3]) const {
     HB_LOCK();
     memcpy(position, loop_.report().position, 3 * sizeof(float));

@@ -274,8 +274,11 @@ void HbDevice::loop_state(const HbMotion& motion, const HbReport& report, uint32
   begin_state(HB_KIND_LOOP, motion, now_us, frame);
   if (report.share > 0.0f) frame[3] |= HB_ENABLED;
   if (report.is_faulty) frame[3] |= HB_FAULT;
+  const float* position = turns() ? motion.rotation : motion.position;
+  const float* velocity = turns() ? motion.angular_velocity : motion.velocity;
   for (int i = 0; i < 3; i++) {
-    put_float(frame + 24 + 4 * i, motion.velocity[i]);
+    put_float(frame + 12 + 4 * i, position[i]);
+    put_float(frame + 24 + 4 * i, velocity[i]);
     put_float(frame + 36 + 4 * i, report.force[i]);
   }
   put_energy(frame + 48, report.passed);

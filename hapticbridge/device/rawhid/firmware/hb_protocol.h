@@ -147,6 +147,9 @@ class HbDevice {
   // True from the first order for a loop until the next force frame.
   bool is_loop() const { return is_loop_; }
 
+  // True if it has no axis but rotations: numbers of a loop are then angles in rad and torques in N m.
+  bool turns() const { return (sheet_.axes & (HB_X | HB_Y | HB_Z)) == 0; }
+
   // As state(), of a loop: its force and account in place of the rotation.
   void loop_state(const HbMotion& motion, const HbReport& report, uint32_t now_us,
                   uint8_t frame[HB_FRAME_BYTES]);

@@ -19,7 +19,9 @@
 
 #include "hb_board.h"
 
-// Reads the handle's position in m; axes that the device lacks stay 0. Called from the interrupt.
+// Reads the handle's position in m; axes that the device lacks stay 0. Of a device that only turns, a
+// knob, it is the angle in rad about its axis, and the force below a torque in N m. Called from the
+// interrupt.
 void read_position(float position[3]);
 
 // Applies a force in N at the handle, zero where there is to be none. Called from the interrupt: it
@@ -81,7 +83,8 @@ class HbSketchBoard {
     wdt_reset();
     if (micros() - last_us_ < period_us_) return;
     last_us_ = micros();
-    write_force(board_.wrench(last_us_).force);
+    const HbWrench wrench = board_.wrench(last_us_);
+    write_force(board_.turns() ? wrench.torque : wrench.force);
   }
 
   void tick() {}
@@ -173,10 +176,12 @@ class HbSketch : public HbSketchBoard {
     if (now_us - due_us_ >= state_period_us_) due_us_ = now_us;  // late: not a burst to catch up
     HbMotion motion;
     memset(&motion, 0, sizeof motion);
-    latch(motion.position);
+    float* position = board_.turns() ? motion.rotation : motion.position;
+    float* velocity = board_.turns() ? motion.angular_velocity : motion.velocity;
+    latch(position);
     for (int i = 0; i < 3; i++) {
-      motion.velocity[i] = (motion.position[i] - last_[i]) / (1e-6f * (float)(now_us - last_us_));
-      last_[i] = motion.position[i];
+      velocity[i] = (position[i] - last_[i]) / (1e-6f * (float)(now_us - last_us_));
+      last_[i] = position[i];
     }
     last_us_ = now_us;
     motion.buttons = buttons;
