@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from audit_cases import COUPLING, ScriptedDevice, SlowClock, recorded, rewritten
 from cli_cases import Called
-from PIL import Image
+from PIL import Image, ImageSequence
 from report_runs import circling
 
 import hapticbridge as hb
@@ -159,6 +159,22 @@ def test_film_has_a_frame_for_every_thirtieth_of_a_second(sway: Path, tmp_path: 
     assert facts["fps"] == pytest.approx(30)
     assert told[-1] == (9, 9)
     assert sum(1 for _ in frames) == 9
+
+
+def test_animated_picture_has_a_frame_for_every_tenth_of_a_second(
+    sway: Path, tmp_path: Path
+) -> None:
+    film = tmp_path / "sway.gif"
+    draw(sway, film, Shot(width=160, height=120, fps=10))
+    with Image.open(film) as picture:
+        assert picture.size == (160, 120)
+        assert len(list(ImageSequence.Iterator(picture))) == 3
+        assert picture.info["duration"] == 100
+        assert picture.info["loop"] == 0
+        picture.seek(0)
+        first = np.asarray(picture.convert("RGB"), float)
+        picture.seek(2)
+        assert np.abs(np.asarray(picture.convert("RGB"), float) - first).max() > 50.0
 
 
 def test_stage_stands_where_a_second_run_of_the_scene_does(sway: Path) -> None:

@@ -90,13 +90,14 @@ class Render:
     Examples:
         hapticbridge render run.mcap run.png --at 2.5
         hapticbridge render run.mcap run.mp4
+        hapticbridge render run.mcap run.gif --fps 10 --width 480 --height 360
         hapticbridge render run.mcap slow.mp4 --start 2 --stop 3 --speed 0.1
     """
 
     file: Path = option(metavar="FILE", is_positional=True)
     """The recording (.mcap)."""
     output: Path = option(metavar="OUTPUT", is_positional=True)
-    """The picture (.png), or the film (.mp4, extra 'view')."""
+    """The picture (.png), or the film (.mp4, extra 'view'; or .gif)."""
     shot: Shot = USUAL_SHOT
     overwrite: bool = False
     """Replace the picture or film if the file exists."""

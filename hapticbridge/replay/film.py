@@ -31,14 +31,21 @@ from hapticbridge.kernel import jit
 from hapticbridge.kernel.codes import added_actuators
 from hapticbridge.kernel.record import TICK_DTYPE, Timeline
 from hapticbridge.recording import RecordingFile, open_recording
-from hapticbridge.replay.stage import Camera, Frame, Stage, film_ticks, write_film
+from hapticbridge.replay.stage import (
+    Camera,
+    Frame,
+    Stage,
+    film_ticks,
+    write_animation,
+    write_film,
+)
 from hapticbridge.run.description import parameters_of
 
 RENDERERS = ("egl", "osmesa")
 """Renderers without a display: EGL with a graphics card or Mesa, OSMesa on the processor alone."""
 
-ENDINGS = (".mp4", ".png")
-"""Endings of the files that ``draw`` writes: a film, a picture."""
+ENDINGS = (".mp4", ".gif", ".png")
+"""Endings of the files that ``draw`` writes: a film, one that every page shows, a picture."""
 
 MAX_PIXELS = 4096
 """Longest side of a picture in pixels. Drivers refuse much larger ones."""
@@ -127,8 +134,8 @@ def draw(
 
     Args:
         recording: The file.
-        out: ``.png`` for one picture, ``.mp4`` for a film as long as the run; an existing file is
-            replaced.
+        out: ``.png`` for one picture, ``.mp4`` or ``.gif`` for a film as long as the run; an
+            existing file is replaced.
         shot: Time, camera and size; the last tick at 800 × 600 by default.
         progress: Called with the finished and all frames.
         in_process: True sets no limits on memory, time and files, for recordings of a known origin.
@@ -137,7 +144,7 @@ def draw(
         The renderer that drew it.
 
     Raises:
-        HapticBridgeError: No renderer works here, the file's ending is unknown, or a film is
+        HapticBridgeError: No renderer works here, the file's ending is unknown, or an ``.mp4`` is
             requested without the extra 'view'.
         RecordingError: The recording cannot be drawn, or the file not written.
         ForeignSceneError: Its scene crashed MuJoCo, or takes too much memory or time.
@@ -234,14 +241,16 @@ def _check_target(target: Path, shot: Shot) -> None:
     check_target(target, HapticBridgeError)
     if target.exists() and not target.is_file():
         raise HapticBridgeError(f"cannot write '{target}': it exists and is not a file")
-    if ending == ".mp4" and shot.at is not None:
+    if ending != ".png" and shot.at is not None:
         raise HapticBridgeError("a time goes with a picture (.png); a film has start and stop")
     if ending == ".png" and shot.is_of_film:
         raise HapticBridgeError(
-            "start, stop, speed and fps go with a film (.mp4); a picture has a time"
+            "start, stop, speed and fps go with a film (.mp4, .gif); a picture has a time"
         )
     if ending == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise HapticBridgeError(f"a film needs the extra 'view': {install_command('view')}")
+        raise HapticBridgeError(
+            f"an .mp4 needs the extra 'view': {install_command('view')}; a .gif needs nothing"
+        )
 
 
 class _Child:
@@ -354,6 +363,8 @@ def _draw(path: Path, out: Path, shot: Shot, worker: Worker) -> str:
             yield camera.frame(tick)
             worker.tell([number, len(ticks)])
 
+    if out.suffix == ".gif":
+        return write_animation(out, frames(), shot.fps)
     write_film(str(out), frames(), (shot.width, shot.height), shot.fps)
     return ""
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image
 
 from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.replay import Resimulator, obstacle
@@ -469,6 +470,32 @@ def write_film(path: str, frames: Iterator[Frame], size: tuple[int, int], fps: i
         raise HapticBridgeError(f"ffmpeg cannot write the film: {_first_line(error)}") from None
     if written != count:
         raise HapticBridgeError(f"ffmpeg wrote {written} of {count} frames; is the disk full?")
+
+
+COLOURS = 64
+"""Colours of a frame in a ``.gif``. More of them make larger files, fewer show steps in shades."""
+
+
+def write_animation(path: Path, frames: Iterator[Frame], fps: int) -> str:
+    """Writes frames as an animated picture that begins anew at its end (GIF).
+
+    Args:
+        path: File to write.
+        frames: Pictures, (height, width, 3) each, at least one.
+        fps: Frames per second; each is shown for a whole number of hundredths of a second.
+
+    Returns:
+        Why it cannot be written, or an empty text.
+    """
+    pictures = (
+        Image.fromarray(frame).quantize(COLOURS, dither=Image.Dither.NONE) for frame in frames
+    )
+    time = 10 * max(round(100 / fps), 2)  # in ms; browsers slow down what is shorter
+    try:
+        next(pictures).save(path, save_all=True, append_images=pictures, duration=time, loop=0)
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
 
 
 def _first_line(error: Exception) -> str:
