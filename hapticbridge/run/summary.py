@@ -322,7 +322,29 @@ class Summary:
         """Describes the run: energies, verdict, coupling, device condition and the next command."""
         return "\n".join(self._lines())
 
+    @property
+    def headline(self) -> str:
+        """The verdict on the run and on its device, in a sentence."""
+        if self.fault is not None:
+            _, port = self.fault
+            what = "the hand got energy that nobody put in"
+            return f"active: {'the simulation made energy' if port == 'environment' else what}"
+        if self.verdict != "passive":
+            return f"{self.verdict}: MuJoCo could not simulate the scene to the end"
+        if self.certification.standing is Standing.NO_HAND:
+            return "passive: the scene gave out no more energy than it got"
+        if self.is_certified:
+            more = f", and {format_energy(self.credit)}" if self.credit else ""
+            more += ", apart from what motors and inputs gave" if self.hand_energy.limit else ""
+            return (
+                "passive, and certified: no hand gets more energy than it puts in or the scene "
+                f"had stored{more}"
+            )
+        judged = "not certified" if self.is_certified is False else "not judged"
+        return f"passive this time, but {judged}: another hand may get energy out of it"
+
     def _lines(self) -> Iterator[str]:
+        yield self.headline
         if self.hands:
             yield from self._lines_of_hands()
             return
