@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import math
+import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -13,9 +15,10 @@ import numpy as np
 import pytest
 from board_attack import built_loop, floats, gained
 from board_processors import CORES, MOST, computed_here, computed_on, memory_on, missing
-from firmware_build import COMPILER
+from firmware_build import COMPILER, FIRMWARE
 from numpy.typing import NDArray
 
+from hapticbridge.cli.guide import page
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import method_named, prepare
 from hapticbridge.device.own_loop import (
@@ -311,12 +314,37 @@ def test_a_tool_that_was_put_elsewhere_ends_the_force_first(library: ctypes.CDLL
     assert loop.tank >= 0.0
 
 
-def test_a_position_that_is_no_number_ends_the_force_for_good(library: ctypes.CDLL) -> None:
-    for value in (np.nan, np.inf, -np.inf):
+def test_a_position_that_is_no_place_ends_the_force_for_good(library: ctypes.CDLL) -> None:
+    for value in (np.nan, np.inf, -np.inf, 1e38, -2e4):
         loop = pressed(library)
         assert np.all(loop.tick([value, 0.0, 0.0]) == 0.0)
         loop.show(np.zeros(3), np.zeros(3))
         assert np.all(loop.tick([-1e-4, 0.0, 0.0]) == 0.0)
+    loop = pressed(library)
+    assert loop.tick([1e4, 0.0, 0.0])[0] == -LEVEL  # far, but a place
+    assert loop.tick([-1e-4, 0.0, 0.0])[0] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("position", "velocity", "surfaces"),
+    [
+        ((1e38, 0.0, 0.0), None, ()),
+        ((0.0, 0.0, -3e38), (0.0, 0.0, -3e38), ()),
+        ((0.0, 0.0, 0.0), (1e38, -1e38, 0.0), ()),
+        ((0.0, 0.0, 0.0), None, (((1.0, 0.0, 0.0), -1e38),)),
+        ((0.0, 0.0, 0.0), None, (((1e38, 1e38, 0.0), -1.0),)),
+    ],
+)
+def test_a_tool_that_is_shown_at_no_place_stays(
+    library: ctypes.CDLL, position: Any, velocity: Any, surfaces: Any
+) -> None:
+    loop = pressed(library)
+    before, passed = loop.tool, loop.passed
+    loop.show(position, velocity, surfaces=surfaces)
+    for _ in range(30):
+        assert loop.tick([-1e-4, 0.0, 0.0])[0] == pytest.approx(2.0, rel=0.01)
+    assert np.array_equal(loop.tool, before)
+    assert loop.passed == passed
 
 
 def test_raised_gains_give_the_spring_no_energy(library: ctypes.CDLL) -> None:
@@ -413,7 +441,7 @@ def test_an_overtaken_or_damaged_tool_is_dropped(library: ctypes.CDLL) -> None:
     frame[9] ^= 1
     assert not board.send(bytes(frame))
     for name in ("stiffness", "damping", "level", "passing", "fade"):
-        for number in (math.inf, math.nan, -1e-3):
+        for number in (math.inf, math.nan, -1e-3, 2e9):
             assert not board.send(setting_frame(22, SETTING._replace(**{name: number})))
     board.run(10)
     assert board.force == pytest.approx([1.0, 0.0, 0.0], rel=0.01)
@@ -460,6 +488,14 @@ def test_a_board_computes_the_same_bits_in_time(core: str, tmp_path: Path) -> No
     flash, memory = memory_on(core, tmp_path)
     assert 4000 < flash < 16_000
     assert 300 < memory < 4000
+
+
+@pytest.mark.skipif(bool(missing()), reason=missing())
+def test_the_guides_command_compiles_the_protocol(tmp_path: Path) -> None:
+    (command,) = re.findall(r"^arm-none-eabi-g.*$", page("stiff-device"), re.MULTILINE)
+    words = [*shlex.split(command), "-o", str(tmp_path / "protocol.o")]
+    subprocess.run(words, check=True, cwd=FIRMWARE)
+    assert (tmp_path / "protocol.o").stat().st_size > 1000
 
 
 def test_the_script_says_what_to_install_where_a_tool_is_missing(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ f = −(K e + B'/T δe) pushes, e = h − y, and else where f = 0. The error is 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -105,40 +106,53 @@ LOOPS = (
 """Loops of the picture."""
 
 
-def tap(device: DeviceInfo, law: Coupling, period: float, delay: float) -> NDArray[np.float64]:
+def wall(law: Coupling, period: float) -> Callable[[float], float]:
+    """Returns the law of a wall at 0: a position in m, read every T in s, to the force in N.
+
+    It keeps e of the last period.
+    """
+    damper, stretch = law.damping / period, 0.0
+
+    def force(position: float) -> float:
+        nonlocal stretch
+        free = damper * stretch / (law.stiffness + damper)
+        last, stretch = stretch, min(position, free)
+        return max(-law.stiffness * stretch - damper * (stretch - last), 0.0)
+
+    return force
+
+
+def tap(
+    device: DeviceInfo, force: Callable[[float], float], period: float, delay: float
+) -> NDArray[np.float64]:
     """Returns the force on the device in N at each step of a tap, from the touch on.
 
     Args:
         device: Mass, damping, friction and resolution; its steps begin at the wall.
-        law: K and B' of the law.
+        force: Law of the loop, called once per period.
         period: T in s, a multiple of ``STEP``.
         delay: Time in s from reading a position to its force, too.
     """
     mass, damping = device.mass or 0.0, device.damping or 0.0
     friction, step = device.friction or 0.0, device.resolution or 0.0
     every, late, count = round(period / STEP), round(delay / STEP), round(DURATION / STEP)
-    damper = law.damping / period
     forces = np.zeros(count + late + every)
-    position, velocity, stretch = 0.0, -SPEED, 0.0
+    position, velocity = 0.0, -SPEED
     for k in range(count):
         if k % every == 0:
             read = step * math.floor(position / step + 0.5) if step else position
-            free = damper * stretch / (law.stiffness + damper)
-            last, stretch = stretch, free if read > free else read
-            force = -law.stiffness * stretch - damper * (stretch - last)
-            forces[k + late : k + late + every] = max(force, 0.0)
+            forces[k + late : k + late + every] = force(read)
         speed = (mass * velocity + STEP * forces[k]) / (mass + STEP * damping)
-        slowed = max(abs(speed) - STEP * friction / mass, 0.0)
-        velocity = math.copysign(slowed, speed)
+        velocity = math.copysign(max(abs(speed) - STEP * friction / mass, 0.0), speed)
         position += STEP * velocity
     return forces[:count]
 
 
 def felt(device: DeviceInfo, loop: Loop) -> float:
     """Returns the error of a tap in just noticeable differences of the ideal wall's force."""
-    spring = Coupling(IDEAL, 0.0, 0.0, 0.0)
-    exact = tap(replace(device, resolution=0.0), spring, STEP, 0.0)
-    found = tap(device, loop.coupling(device), 1.0 / loop.rate, loop.delay)
+    period, ideal = 1.0 / loop.rate, wall(Coupling(IDEAL, 0.0, 0.0, 0.0), STEP)
+    exact = tap(replace(device, resolution=0.0), ideal, STEP, 0.0)
+    found = tap(device, wall(loop.coupling(device), period), period, loop.delay)
     return felt_error(_records(exact), _records(found)).jnd
 
 

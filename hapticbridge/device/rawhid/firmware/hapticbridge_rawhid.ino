@@ -3,15 +3,15 @@
 // direction pin. It runs a loop of its own at 10 kHz for a host that shows its tool, and follows
 // forces of a host that sends them.
 //
-// Tools > USB Type > Raw HID. Files: this sketch, the five of the name hb_*.h and hb_protocol.cpp in
-// one folder named hapticbridge_rawhid. Needs only Teensyduino (its Encoder library and
+// Tools > USB Type > Raw HID. Files: this sketch, the five of the name hb_*.h and hb_protocol.cpp
+// in one folder named hapticbridge_rawhid. Needs only Teensyduino (its Encoder library and
 // IntervalTimer). Then, on the computer: hapticbridge devices
 //
 // FILL IN the device. The numbers here are an example: MEASURE YOURS. This sketch has not been
 // verified on hardware. hapticbridge guide stiff-device goes through it.
 //
 // Before the first run: paddle unloaded, hand on the power switch, duty limit at 0.2. Push the
-// paddle: if it runs away instead of resisting, swap the motor's wires or the sign in write_force().
+// paddle: if it runs away instead of resisting, swap the motor's wires or write_force()'s sign.
 
 #include <Encoder.h>
 #include <math.h>

@@ -12,7 +12,7 @@
 // verified on hardware. hapticbridge guide stiff-device goes through it.
 //
 // Before the first run: paddle unloaded, hand on the power switch, duty limit at 0.2. Push the
-// paddle: if it runs away instead of resisting, swap the motor's wires or the sign in write_force().
+// paddle: if it runs away instead of resisting, swap the motor's wires or write_force()'s sign.
 
 #include <math.h>
 #include <string.h>
@@ -94,6 +94,9 @@ void control_tick() { device.tick(); }
 void setup() {
   pinMode(PIN_DIRECTION, OUTPUT);
   pinMode(PIN_PWM, OUTPUT);
+#ifdef TEENSYDUINO  // another board's PWM should be as fast: its period is part of loop_delay
+  analogWriteFrequency(PIN_PWM, 36000.0f);
+#endif
   analogWrite(PIN_PWM, 0);
   Serial.begin(BAUD);
   device.start(control_tick);

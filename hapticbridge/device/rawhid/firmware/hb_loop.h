@@ -98,7 +98,7 @@ struct HbReport {
   float tool[3];       // y in m
   float force[3];      // on the device in N
   float share;         // of the gains in force, 0 to 1
-  bool is_faulty;      // a position was not finite: no force until the board restarts
+  bool is_faulty;      // a position was no place: no force until the board restarts
 };
 
 // How well the timer keeps the period.
@@ -174,7 +174,7 @@ class HbLoop {
   // Runs one period: `position` of the handle in m to `force` on the device in N.
   void tick(const float position[3], float force[3]) {
     float step[3], moved[3], u[3];
-    report_.is_faulty = report_.is_faulty || !is_finite(position);
+    report_.is_faulty = report_.is_faulty || !is_place(position);
     if (report_.is_faulty) {
       memset(force, 0, 3 * sizeof(float));
       memset(report_.force, 0, sizeof report_.force);
@@ -189,6 +189,7 @@ class HbLoop {
     copy(report_.position, position);
     change_gains();
     aim(step);
+    if (!is_place(step)) copy(step, report_.tool);
     subtract(step, report_.tool, step);
     float share = 1.0f;
     const float least = -hb_joules(report_.tank);
@@ -232,12 +233,13 @@ class HbLoop {
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
   }
 
-  // Tests the bits, so that it holds under -ffast-math too.
-  static bool is_finite(const float vector[3]) {
+  // True for a place within 16 km, so that no product of it overflows. It tests the bits, so that it
+  // holds under -ffast-math too.
+  static bool is_place(const float vector[3]) {
     uint32_t bits[3];
     memcpy(bits, vector, sizeof bits);
     for (int i = 0; i < 3; i++) {
-      if ((bits[i] & 0x7F800000u) == 0x7F800000u) return false;
+      if ((bits[i] & 0x7F800000u) >= 0x46800000u) return false;
     }
     return true;
   }

@@ -6,6 +6,7 @@
 namespace {
 
 const size_t CRC_AT = HB_FRAME_BYTES - 2;
+const float LARGEST = 1e9f;  // of gains and times, in SI units
 
 // Byte by byte, so that the frame is little-endian on any processor.
 void put16(uint8_t* at, uint16_t value) {
@@ -233,7 +234,8 @@ bool HbDevice::take_order(const uint8_t frame[HB_FRAME_BYTES]) {
   } else if (frame[2] == HB_KIND_SETTING) {
     if (!are_finite(frame + 8, 5)) return false;
     for (int i = 0; i < 5; i++) {
-      if (get_float(frame + 8 + 4 * i) < 0.0f) return false;  // it would push the hand
+      const float value = get_float(frame + 8 + 4 * i);
+      if (value < 0.0f || value > LARGEST) return false;  // it pushes the hand, or overflows
     }
     HbSetting& setting = order_.setting;
     setting.gains.stiffness = get_float(frame + 8);

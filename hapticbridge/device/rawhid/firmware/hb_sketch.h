@@ -55,8 +55,9 @@ struct HbMotor {
   // Returns the share of full PWM for a force in N, within the limit; its sign is the force's.
   float duty(float force) {
     const float share = force / force_limit();
-    is_saturated = fabsf(share) > 1.0f;
-    return duty_limit * fmaxf(fminf(share, 1.0f), -1.0f);
+    is_saturated = !(fabsf(share) <= 1.0f);
+    if (!is_saturated) return duty_limit * share;
+    return share > 0.0f ? duty_limit : share < 0.0f ? -duty_limit : 0.0f;  // none for no number
   }
 
   // Returns the time in s in which the current follows the voltage. It counts as a delay.
@@ -109,7 +110,7 @@ inline void hb_start_timer(void (*tick)(), uint32_t period_us) {
 #elif defined(HB_OWN_TIMER)
 void hb_start_timer(void (*tick)(), uint32_t period_us);
 #else
-#error "define HB_OWN_TIMER and hb_start_timer(): 'hapticbridge guide stiff-device' has it for boards"
+#error "define HB_OWN_TIMER and hb_start_timer(): see 'hapticbridge guide stiff-device'"
 #endif
 
 static const bool HB_HAS_LOOP = true;
@@ -125,9 +126,9 @@ class HbSketchBoard {
   // Runs what is due in loop().
   void poll() {}
 
-  // Runs one period, in the timer's interrupt. It renders without loop(): if that hangs, no frame is
-  // received, and the patience or the watchdog of the last one ends the force here. A processor that
-  // has stopped keeps its PWM: drive an enable input of the driver by a hardware watchdog.
+  // Runs one period, in the timer's interrupt. It renders without loop(): if that hangs, no frame
+  // is received, and the patience or the watchdog of the last one ends the force here. A processor
+  // that has stopped keeps its PWM: drive an enable input of the driver by a hardware watchdog.
   void tick() {
     float position[3] = {0.0f, 0.0f, 0.0f}, force[3];
     read_position(position);
