@@ -1,4 +1,4 @@
-"""Takes the pictures of the pages that the README shows, in a headless Chromium.
+"""Takes the pictures of the pages that the guide shows, in a headless Chromium.
 
     python scripts/draw_pages.py RECORDING ACTIVE_RECORDING FOLDER
 

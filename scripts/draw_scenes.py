@@ -90,7 +90,7 @@ def main() -> int:
         "--gallery",
         type=Path,
         help="one picture of them all (default where no scene is named and no --out is given: "
-        "scripts/figures/scenes.png)",
+        "hapticbridge/guide/scenes.png)",
     )
     asked = parser.parse_args()
     pictures = {}
@@ -101,7 +101,7 @@ def main() -> int:
             pictures[name].save(folder / f"{Path(name).stem}.png", optimize=True)
         target = asked.gallery
         if target is None and not asked.scenes and not asked.out:
-            target = ROOT / "scripts" / "figures" / "scenes.png"
+            target = ROOT / "hapticbridge" / "guide" / "scenes.png"
         if target is not None:
             gallery(pictures).save(target, optimize=True)
     except (HapticBridgeError, OSError) as error:

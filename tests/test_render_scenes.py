@@ -39,7 +39,7 @@ def test_a_scene_is_drawn_or_the_missing_renderer_is_named(tmp_path: Path) -> No
     # drivers differ in edges and shadows, not in what is where
     assert drawn.shape == shipped.shape
     assert np.median(np.abs(drawn - shipped)) < 8
-    for file in (tmp_path / "all.png", ROOT / "scripts/figures/scenes.png"):
+    for file in (tmp_path / "all.png", ROOT / "hapticbridge/guide/scenes.png"):
         assert file.stat().st_size < 300_000
         with Image.open(file) as picture:
             assert picture.width == 800

@@ -327,7 +327,7 @@ class Summary:
         """The verdict on the run and on its device, in a sentence."""
         if self.fault is not None:
             _, port = self.fault
-            what = "the hand got energy that nobody put in"
+            what = "the hand got energy for which nothing paid"
             return f"active: {'the simulation made energy' if port == 'environment' else what}"
         if self.verdict != "passive":
             return f"{self.verdict}: MuJoCo could not simulate the scene to the end"
