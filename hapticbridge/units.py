@@ -1,9 +1,10 @@
-"""Numbers with units."""
+"""Numbers with units, as text and as HTML."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from html import escape
 
 _PREFIXES = (
     (1e9, "G"),
@@ -105,3 +106,17 @@ def energy_rows(
 
 ROUNDING = 1e-12
 """Energy in J, force in N and torque in N m below which a number is rounding and shown as 0."""
+
+
+# In a notebook
+
+
+def facts_html(title: str, rows: Iterable[tuple[str, str]], notes: Iterable[str] = ()) -> str:
+    """Returns HTML of a title, a table of facts and notes; all of them are plain text."""
+    cells = "".join(
+        f"<tr><th style='text-align:left'>{escape(name)}</th>"
+        f"<td style='text-align:left'>{escape(text)}</td></tr>"
+        for name, text in rows
+    )
+    below = "".join(f"<div>{escape(note)}</div>" for note in notes)
+    return f"<b>{escape(title)}</b><table>{cells}</table>{below}"

@@ -49,7 +49,7 @@ from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
 from hapticbridge.run.description import meta_start, requested_of
 from hapticbridge.run.summary import Environment, posted_words, was_never_lossless
-from hapticbridge.units import format_energy
+from hapticbridge.units import facts_html, format_energy
 
 Verdict = Literal["passive", "unverified", "active", "invalid"]
 
@@ -141,6 +141,16 @@ class AuditReport:
         """The verdict in a few words; see ``verdict_words``."""
         environment = "toward the hand" if self.credit else self.environment or ""
         return verdict_words(self.verdict, environment, self.port)
+
+    def _repr_html_(self) -> str:
+        """Returns verdict, reason and conditions as HTML, for a notebook."""
+        rows = [
+            ("why", self.reason),
+            ("simulated again", self.resimulation),
+            ("ran", f"{self.duration:.3f} s, {self.ticks} ticks"),
+        ]
+        notes = (*self.coupling_sentences, *self.conditions)
+        return facts_html(f"{self.path.name}: {self.words}", rows, notes)
 
     def to_json(self) -> str:
         """Returns the report as one JSON object; a number that is not finite becomes null."""

@@ -21,6 +21,7 @@ from hapticbridge.recording import format as layout
 from hapticbridge.recording import ros_messages
 from hapticbridge.recording.container import MAGIC, Block, Container, DamageError, Fields, FileBytes
 from hapticbridge.recording.format import Attachment
+from hapticbridge.units import facts_html
 
 # Metadata, attachments, events and ticks of a container
 
@@ -358,6 +359,14 @@ class Recording(RecordingFile):
     """
 
     ticks: NDArray[np.void]
+
+    def _repr_html_(self) -> str:
+        """Returns length, origin and damage as HTML, for a notebook."""
+        rows = [(name, self.meta.get(name, "")) for name in ("scene", "grip", "method", "started")]
+        rows = [row for row in rows if row[1]]
+        rows.append(("ran", f"{len(self.ticks) * self.period:.3f} s, {len(self.ticks)} ticks"))
+        rows.append(("events", str(len(self.events))))
+        return facts_html(self.path.name, rows, (*self.problems, self.cut_sentence))
 
     def to_pandas(self) -> Any:
         """Returns the ticks as a ``pandas.DataFrame`` with the index ``seconds``.

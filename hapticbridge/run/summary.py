@@ -33,7 +33,14 @@ from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import TickFlag
-from hapticbridge.units import energy_rows, format_energy, format_share, format_si, format_wrenches
+from hapticbridge.units import (
+    energy_rows,
+    facts_html,
+    format_energy,
+    format_share,
+    format_si,
+    format_wrenches,
+)
 
 # Sentences on the effective coupling and its law
 
@@ -321,6 +328,12 @@ class Summary:
     def __str__(self) -> str:
         """Describes the run: energies, verdict, coupling, device condition and the next command."""
         return "\n".join(self._lines())
+
+    def _repr_html_(self) -> str:
+        """Returns the text as HTML, for a notebook."""
+        headline, *lines = self._lines()
+        names = () if self.hands else tuple(self._rows())
+        return facts_html(headline, names, lines[len(names) :])
 
     @property
     def headline(self) -> str:
