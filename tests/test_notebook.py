@@ -11,6 +11,10 @@ import pytest
 import hapticbridge as hb
 
 
+ASKED = "_repr_html_"
+"""Method that notebooks ask a result for."""
+
+
 class Seen(HTMLParser):
     """Collects the text of a page, and refuses tags that are open at its end."""
 
@@ -18,7 +22,7 @@ class Seen(HTMLParser):
         super().__init__()
         self.words: list[str] = []
         self._open: list[str] = []
-        self.feed(result._repr_html_())
+        self.feed(getattr(result, ASKED)())
         assert not self._open
 
     def handle_starttag(self, tag: str, attrs: object) -> None:
