@@ -507,3 +507,54 @@ def test_the_script_says_what_to_install_where_a_tool_is_missing(tmp_path: Path)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert "on Debian: apt install g++ gcc-arm-none-eabi" in done.stderr
+
+
+def test_a_force_frame_ends_a_setting_too(library: ctypes.CDLL) -> None:
+    """A later host's tool has no force until this host has told its own coupling."""
+    board = at_a_wall(library)
+    assert np.linalg.norm(board.force) > 0.5
+    assert board.send(force_frame(22, (0.0,) * 6, 50))
+    board.run(1)
+    for sequence in range(23, 43):
+        board.position -= [1e-5, 0.0, 0.0]
+        assert board.send(*show_frames(sequence, ShownTool((0.0,) * 3, None, 0.0, WALL), 50))
+        board.run(10)
+    assert np.linalg.norm(board.force) == 0.0
+    assert board.send(setting_frame(43, SETTING))
+    board.run(20)
+    board.position -= [5e-5, 0.0, 0.0]
+    board.run(20)
+    assert np.linalg.norm(board.force) > 0.5
+
+
+@pytest.mark.parametrize(("pace_us", "missed"), [(100, 0), (101, 0), (110, 90), (200, 990)])
+def test_a_slow_timer_misses_periods(library: ctypes.CDLL, pace_us: int, missed: int) -> None:
+    board = at_a_wall(library)
+    for _ in range(40):
+        board.send(*show_frames(22, ShownTool((0.0,) * 3), 1000))
+        board.run(25, pace_us)
+        state = board.state()
+    found = [each for _ in range(40) if isinstance(each := board.state(), LoopReport)]
+    assert state is not None
+    assert found[-1].missed == pytest.approx(missed, abs=0.03 * missed + 1)
+
+
+def test_gains_on_their_way_ask_no_more_of_a_device_than_their_ends(library: ctypes.CDLL) -> None:
+    """A hand that swings from period to period feels K T/2 + B of them at once."""
+    bound, swing = 1.0, 1e-6
+    loop = Loop(library, stiffness=2.0 * bound / PERIOD, damping=0.0, fade=200 * PERIOD)
+    loop.show((0.0, 0.0, 0.0))
+
+    def demands(periods: int) -> list[float]:
+        found = []
+        for tick in range(periods):
+            sign = 1.0 if tick % 2 else -1.0
+            force = loop.tick(np.array([sign * swing, 0.0, 0.0]))
+            found.append(-sign * float(force[0]) * PERIOD / (2.0 * swing))
+        return found
+
+    assert demands(1000)[-1] == pytest.approx(bound, rel=1e-3)
+    loop.set(stiffness=0.0, damping=bound)
+    found = demands(1000)
+    assert max(found) < 1.001 * bound
+    assert found[-1] == pytest.approx(bound, rel=1e-3)

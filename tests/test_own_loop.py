@@ -17,10 +17,13 @@ import hapticbridge as hb
 from hapticbridge.demand.own_loop import REPORT_DTYPE, ROUNDING, OwnLoopTally
 from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.device.driver import ignore_message
+from hapticbridge.device.own_loop import LoopState, ShownTool
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
 from hapticbridge.device.simulated.device import hand_for
 from hapticbridge.errors import DeviceError
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.run.commands import Couple, Reset, Switch
+from hapticbridge.run.own_loop import OwnLoop
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler on this machine")
 
@@ -269,3 +272,105 @@ def test_another_run_on_the_same_board_begins_anew(library: ctypes.CDLL, tmp_pat
     assert own.passed > -ROUNDING
     assert bench.gained < ROUNDING
     assert hb.audit(tmp_path / "run.mcap", in_process=True).verdict == "passive"
+
+
+def test_a_force_that_is_let_go_fades_in_the_time_of_the_host(library: ctypes.CDLL) -> None:
+    """The slow ramp of a start is none of a dead-man button's."""
+    bench, forces = Bench(library), []
+    with bench.bridge(limits=hb.Limits(ramp=0.5)) as bridge:
+
+        def on_tick(tick: int) -> None:
+            if tick == 1500:
+                bridge.command(Switch(force=False))
+            forces.append(float(np.linalg.norm(bench.board.force)))
+
+        bridge.run(1.6, on_tick)
+    assert forces[1499] > 1.0
+    assert forces[1530] == 0.0
+
+
+@pytest.mark.parametrize("is_cut", [True, False])
+def test_a_run_ends_what_an_earlier_program_has_left(
+    library: ctypes.CDLL, tmp_path: Path, *, is_cut: bool
+) -> None:
+    """A program that dies behind a broken link leaves its coupling, its count and a tank."""
+    bench, path = Bench(library), tmp_path / "run.mcap"
+
+    def die(tick: int) -> None:
+        if tick == 800:
+            assert np.linalg.norm(bench.board.force) > 1.0
+            bench.board.is_cut = is_cut
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), bench.bridge() as bridge:
+        bridge.run(1.0, die)
+    bench.board.is_cut = False
+    bench.device = bench.opened()
+    forces = []
+    with bench.bridge(limits=hb.Limits(force=0.5), recording=path) as bridge:
+        bridge.run(0.3, lambda _: forces.append(float(np.linalg.norm(bench.board.force))))
+    assert 0.1 < max(forces) <= 0.5 * (1.0 + 1e-6)
+    assert forces[0] == 0.0
+    assert hb.audit(path, in_process=True).verdict == "passive"
+
+
+class Answering:
+    """A device that is shown tools, and answers the newest alone."""
+
+    place, loop_report = (0.0, 0.0, 0.0), None
+
+    def __init__(self, info: hb.DeviceInfo) -> None:
+        self.info, self.loop_state = info, loop_state(0, 0.0)
+        self.shown: list[float] = []
+
+    def read(self, _sample: object) -> int:
+        return 0
+
+    def set_loop(self, _setting: object) -> None:
+        """Takes any coupling."""
+
+    def show(self, shown: ShownTool) -> int:
+        self.shown.append(shown.work)
+        return len(self.shown)
+
+
+def loop_state(echo: int, passed: float) -> LoopState:
+    return LoopState(0, 0, 0, 0, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3, passed, 0.0, echo)
+
+
+@pytest.mark.parametrize(("passed", "is_paid"), [(-5e-3, True), (-6e-3, False)])
+def test_what_a_tool_released_counts_if_no_report_answers_it(
+    library: ctypes.CDLL, passed: float, *, is_paid: bool
+) -> None:
+    """The device may have used the work of a tool before that of the one which it answers."""
+    bench = Bench(library, "point_mass")
+    with bench.bridge() as bridge:
+        bound, device = bridge.session.kernel.bound, Answering(bench.device.info)
+        loop = OwnLoop(device, bound, bridge.session.parameters)  # type: ignore[arg-type]
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        loop.read(sample)
+        for work in (0.0, -5e-3, 1e-3):
+            bound.state["energy"]["coupling_work"] = work
+            loop.write(np.zeros(6))
+        assert device.shown == pytest.approx([0.0, -5e-3, 1e-3])
+        device.loop_state = loop_state(3, passed)
+        loop.read(sample)
+        assert loop.take_notes() is not None
+    assert (loop.tally.account.first_excess is None) is is_paid
+    assert loop.tally.account.work == pytest.approx(1e-3)
+
+
+def test_a_board_that_does_not_count_its_periods_is_not_certified(library: ctypes.CDLL) -> None:
+    bench = Bench(library)
+    bench.board.has_counters = False
+    with bench.bridge() as bridge:
+        summary = bridge.run(1.5)
+    assert summary.certification.is_by_time
+
+
+def test_counters_of_a_board_may_begin_anew(library: ctypes.CDLL) -> None:
+    tally = OwnLoopTally.begin(1e-4, 0.0)
+    tally.add(reports(), {"changes": 1.0, "ticks": 2**32 - 10, "missed": 3})
+    tally.add(reports(), {"changes": 3.0, "ticks": 20, "missed": 4})
+    own = tally.account
+    assert (own.periods, own.missed, own.changes) == (30, 1, 2.0)

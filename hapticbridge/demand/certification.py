@@ -233,7 +233,7 @@ def certification_of(
         kept = Timekeeping.from_times(times, parameters, judged, info.rate)
     else:
         own = replace(parameters, period=parameters.loop_period, guarding=UNGUARDED)
-        kept = Timekeeping.from_times(own_loop.times(times), own, judged)
+        kept = Timekeeping.from_times(own_loop.times(times, parameters.period), own, judged)
         kept = replace(kept, silence=silence_in(times, parameters))
     verdict = is_run_certified(conditions, method)
     if info.is_prescribed:

@@ -29,6 +29,14 @@ ROUNDING = 1e-6
 """Energy in J by which Σ P may pass its bound: the loop adds in single precision."""
 
 
+UNCOUNTED = 1.0
+"""Time in s at the ends of a run that counters of the loop may lack: they come about 30 times per
+second, and a link may lose some. A larger one certifies longer runs without any."""
+
+_COUNTED = 2**32
+"""Periods after which a counter of the board begins anew."""
+
+
 @dataclass(frozen=True, slots=True)
 class OwnLoopAccount:
     """Account of a loop of the device's own: the hand got no more than the scene had released.
@@ -63,13 +71,17 @@ class OwnLoopAccount:
     missed: int = 0
     changes: float = 0.0
 
-    def times(self, times: RunTimes) -> RunTimes:
-        """Returns the times of a run as those of the loop: it reads in time or misses a period."""
+    def times(self, times: RunTimes, period: float) -> RunTimes:
+        """Returns the times of a run as those of the loop: it reads in time or misses a period.
+
+        Periods that its counters lack are missed ones. ``period`` is T of the run in s.
+        """
         periods = max(self.periods, 1)
+        least = (times.due * period - UNCOUNTED) / self.period
         return replace(
             times,
             ticks=periods,
-            due=periods + self.missed,
+            due=max(periods + self.missed, int(least)),
             fresh=1.0,
             new_samples=periods,
             mean_delay=0.0,
@@ -148,8 +160,8 @@ class OwnLoopTally:
             self._first = first = self._first or counters
             own = replace(
                 own,
-                periods=int(counters["ticks"] - first["ticks"]),
-                missed=int(counters["missed"] - first["missed"]),
+                periods=int(counters["ticks"] - first["ticks"]) % _COUNTED,
+                missed=int(counters["missed"] - first["missed"]) % _COUNTED,
                 changes=counters["changes"] - first["changes"],
             )
         self.account = own

@@ -5,7 +5,8 @@
 
 The device's loop renders the coupling at its own period; its account is that of
 ``kernel.shown_tool``. The scene is pulled at by the same coupling in the bridge's tick, so W is
-exact. The force follows the lever: at 0 it fades on the device, and a lowered one softens it.
+exact. The force follows the lever: on its way to 0 it fades on the device, which renders a lower
+one softer.
 """
 
 from __future__ import annotations
@@ -17,7 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.demand.own_loop import COUNTERS, REPORT_DTYPE, OwnLoopTally
-from hapticbridge.device.own_loop import SURFACES, BoardSetting, LoopDevice, ShownTool
+from hapticbridge.device.own_loop import (
+    SURFACES,
+    BoardSetting,
+    LoopDevice,
+    LoopState,
+    ShownTool,
+)
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.shown_tool import FASTEST, FASTEST_TURN, shown_to_device
@@ -63,13 +70,20 @@ class OwnLoop:
         self._show = direct(shown_to_device, bound.state, lead, self._numbers)
         loop, guard = bound.state["loop"], bound.state["guard"]
         self._reported, self._tick = loop["reported"][0], loop["tick"]
-        self._lever, self._cap = guard["lever"], bound.state["watch"]["max_lever"]
-        self._coupling, self._level = bound.state["coupling"], bound.state["level"]["level"][0]
-        self._told: tuple[float, ...] = ()
-        self._told_tick, self._is_followed, self._last_lever = 0, False, 0.0
-        self._works, self._sent = np.zeros(_REMEMBERED), np.full(_REMEMBERED, -1, np.int64)
+        self._lever, self._rise_ticks = guard["lever"], guard["rise_ticks"]
+        self._cap, self._coupling = bound.state["watch"]["max_lever"], bound.state["coupling"]
+        self._told_tick = 0
+        self._works, self._least_works = np.zeros(_REMEMBERED), np.zeros(_REMEMBERED)
+        self._sent = np.full(_REMEMBERED, -1, np.int64)
+        self._least_work = self._least_known = 0.0  # of all that was sent, of all that was answered
         self._reports: list[tuple[int, float, float, float]] = []
+        self.begin()
         self.tally = OwnLoopTally.begin(parameters.loop_period, parameters.guarding.resolution)
+
+    def begin(self) -> None:
+        """Begins a run, or goes on with it: the device has no coupling and no tool."""
+        self._told: tuple[float, ...] = ()
+        self._is_followed, self._last_lever = False, 0.0
 
     def read(self, sample: NDArray[np.void]) -> int:
         """Reads the newest pose and the wrench there, as ``Device.read``."""
@@ -80,15 +94,26 @@ class OwnLoop:
             return flags
         self._reported[self._part], self._is_followed = state.force, True
         place, tick = state.echo % _REMEMBERED, int(self._tick[0])
-        self._reports.append((tick, float(self._works[place]), state.passed, state.tank))
+        self._note(place, tick, state)
         if self._sent[place] >= 0 and not flags:
             took = self._parameters.period * float(tick - self._sent[place])
             self._lead += AGILITY * (took - self._lead)
         return flags
 
+    def _note(self, place: int, tick: int, state: LoopState) -> None:
+        """Notes a report; and first the least W among tools that no report has answered."""
+        least = float(self._least_works[place])
+        if least < min(self._least_known, float(self._works[place])):
+            self._reports.append((tick, least, state.passed, state.tank))
+        self._least_known = min(self._least_known, least)
+        self._reports.append((tick, float(self._works[place]), state.passed, state.tank))
+
     def write(self, _wrench: NDArray[np.float64]) -> None:
         """Shows the tool of the step that just ended, in the place of ``Device.write``."""
-        self._tell()
+        lever, cap = float(self._lever[0]), float(self._cap[0])
+        is_rising, is_falling = lever > self._last_lever, lever < min(self._last_lever, cap)
+        self._last_lever = lever
+        self._tell(cap, is_rising=is_rising)
         count = self._show(self._state, self._lead, self._numbers)
         dx, dy, dz, vx, vy, vz, work, *planes = self._numbers.tolist()
         x, y, z = self._device.place
@@ -102,38 +127,33 @@ class OwnLoop:
             work,
             surfaces,
             is_placed=not self._is_followed,
-            is_enabled=self._is_on(),
+            is_enabled=lever > 0.0 and not is_falling,
         )
         place = self._device.show(shown) % _REMEMBERED
         self._works[place], self._sent[place] = work, self._tick[0]
+        self._least_work = self._least_works[place] = min(self._least_work, work)
 
-    def _is_on(self) -> bool:
-        """Returns False while the lever falls, which the device's own fade then follows."""
-        lever, last = float(self._lever[0]), self._last_lever
-        self._last_lever = lever
-        return lever > 0.0 and not (lever < last and lever < self._cap[0])
-
-    def _tell(self) -> None:
+    def _tell(self, cap: float, *, is_rising: bool) -> None:
         """Tells the device its coupling, when that changes and now and then."""
-        setting = self._setting()
+        setting = self._setting(cap, is_rising=is_rising)
         tick = int(self._tick[0])
-        if setting != self._told or tick - self._told_tick >= _REPEAT:
+        is_old = not self._is_followed or tick - self._told_tick >= _REPEAT
+        if is_old or setting != self._told:
             self._told, self._told_tick = setting, tick
             self._device.set_loop(setting)
 
-    def _setting(self) -> BoardSetting:
+    def _setting(self, cap: float, *, is_rising: bool) -> BoardSetting:
         """Returns the coupling at the device; with a lever r it is r² as stiff."""
         own, coupling = self._parameters, self._coupling
         gains = coupling["tuning_goal"] if coupling["tuning_ticks"][0] else coupling
-        cap = float(self._cap[0])
         stiffness, damping = (float(gains[name][0]) for name in self._names)
-        is_risen = self._lever[0] >= cap
+        ticks = self._rise_ticks[0] + 1 if is_rising else own.guarding.fade_ticks
         return BoardSetting(
             stiffness=self._ratio * cap * cap * stiffness,
             damping=self._ratio * cap * cap * damping,
             level=cap * self._limit,
             passing=cap * self._passing,
-            fade=own.period * (own.guarding.fade_ticks if is_risen else max(own.ramp_ticks, 1)),
+            fade=own.period * int(ticks),
         )
 
     def take_notes(self) -> dict[str, Any] | None:

@@ -577,6 +577,8 @@ class Session:
             self.end = -1
         if self.tick:  # the device may have moved meanwhile, under zero force
             (self.kernel.hands or self.kernel.bound).resume()
+            if self._own_loop is not None:
+                self._own_loop.begin()
             self.event("resume", reason=self.stopped_by, **self._signal_detail())
         self.stopped_by = self.signal = ""
         self.last_trip = None

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from emulated.hid_device import HidDevice
 from emulated.rawhid_model import RawHid
 from hapticbridge.device import SimulatedDevice
+from hapticbridge.device.own_loop import LoopReport
+from hapticbridge.device.rawhid.protocol import decoded
 
 STATE_PERIOD = 1.01e-3
 """Time in s between two state frames: a little more than a full-speed host polls in."""
@@ -46,6 +48,8 @@ class LoopBoard(HidDevice):
         work: Energy in J that the motors have given the handle.
         burned: Energy in J that the stated damping has burned meanwhile.
         skip_every: Number of periods of which one is missed; 0 for none.
+        has_counters: False for a board that never sends the counters of its loop.
+        is_cut: True while nothing from the host arrives.
     """
 
     vendor, product, serial = RawHid.vendor, RawHid.product, "7"
@@ -76,6 +80,7 @@ class LoopBoard(HidDevice):
         self._to_board: deque[tuple[float, bytes]] = deque()
         self.work = self.burned = 0.0
         self.status = self.skip_every = 0
+        self.has_counters, self.is_cut = True, False
 
     def advance(self, now: float) -> None:
         if self._start is None:
@@ -87,7 +92,9 @@ class LoopBoard(HidDevice):
             self._tick(due)
             if due - self._start >= (self._states + 1) * STATE_PERIOD:
                 self._states += 1
-                self._to_host.append((due + self._link, self._state(due)))
+                state = self._state(due)
+                if self.has_counters or not isinstance(decoded(state), LoopReport):
+                    self._to_host.append((due + self._link, state))
             frame = ctypes.create_string_buffer(64)
             if self._library.board_answer(self._board, frame):
                 self._to_host.append((due + self._link, frame.raw))
@@ -98,7 +105,8 @@ class LoopBoard(HidDevice):
         return now if self._start is None else self._start + (self._ticks + 1) * self.sheet.period
 
     def output(self, report: bytes, now: float) -> None:
-        self._to_board.append((now + self._link, report))
+        if not self.is_cut:
+            self._to_board.append((now + self._link, report))
 
     def _read(self) -> NDArray[np.float32]:
         position, step = self._place(), self.sheet.resolution

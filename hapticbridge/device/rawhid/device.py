@@ -322,10 +322,16 @@ class RawHidDevice:
         self._link.take()
         for report in reports(self._link, FIRST_STATE_MS):
             if states.takes(report):
-                break
+                if isinstance(states.newest, State):
+                    break
+                self._end_force()  # of a tool that an earlier program has shown
         if states.newest is None:
             raise DeviceError(
                 f"{self._name} sends no state frames within {FIRST_STATE_MS} ms; check its firmware"
+            )
+        if isinstance(states.newest, LoopState):
+            raise DeviceError(
+                f"{self._name} follows a tool that another program shows; end that program"
             )
         if states.newest.status & Status.NOT_READY:
             raise DeviceError(
@@ -388,7 +394,10 @@ class RawHidDevice:
             return
         self._is_open = False
         with released(self._link, self.last_word):
-            self._send(force_frame(self._next(), NO_WRENCH, 1, is_enabled=False))
+            self._end_force()
+
+    def _end_force(self) -> None:
+        self._send(force_frame(self._next(), NO_WRENCH, 1, is_enabled=False))
 
     @property
     def loop_state(self) -> LoopState | None:

@@ -27,13 +27,17 @@
 // Periods of state frames between two frames with the loop's counters.
 static const uint8_t HB_REPORT_EVERY = 32;
 
+// Time between two periods, in T, up to which a timer is not slow: clocks differ by less.
+static const float HB_SLOW = 1.01f;
+
 class HbBoard {
  public:
   // Creates a board without a force; `period` is T in s.
   HbBoard(const HbSheet& sheet, float period)
       : device_(with_rate(sheet, period)),
         loop_(period),
-        period_us_((uint32_t)(1e6f * period + 0.5f)),
+        period_us_(1e6f * period),
+        late_us_(0.0f),
         last_us_(0),
         is_loop_(false),
         is_unfit_(false),
@@ -82,12 +86,8 @@ class HbBoard {
   // Runs one period, in the timer's interrupt: `position` of the handle in m to `force` in N, or angles
   // in rad to torques in N m of a device that only turns.
   void tick(const float position[3], uint32_t now_us, float force[3]) {
-    const uint32_t since = now_us - last_us_;
-    if (pace_.ticks > 0 && since > period_us_ + period_us_ / 2) {
-      pace_.missed += (since + period_us_ / 2) / period_us_ - 1;
-    }
+    if (pace_.ticks++ > 0) keep_pace((float)(now_us - last_us_));
     last_us_ = now_us;
-    pace_.ticks++;
     if (!is_loop_ || is_unfit_) loop_.end();  // or its spring would be stretched without a force
     loop_.tick(position, force);
     if (is_loop_) return;
@@ -114,6 +114,14 @@ class HbBoard {
     return sheet;
   }
 
+  // Counts missed periods: those of a gap, and those that a slow timer loses in the long run.
+  void keep_pace(float since) {
+    late_us_ = fmaxf(late_us_ + since - HB_SLOW * period_us_, fminf(late_us_, 0.0f));
+    const float missed = floorf(late_us_ / period_us_ + 0.5f);
+    pace_.missed += (uint32_t)missed;
+    late_us_ -= missed * period_us_;
+  }
+
   void pass_on() {
     const HbOrder& order = device_.order();
     HB_LOCK();
@@ -128,7 +136,8 @@ class HbBoard {
   HbLoop loop_;
   HbCommand command_;
   HbPace pace_;
-  const uint32_t period_us_;
+  const float period_us_;
+  float late_us_;  // behind the timer's due time, as far as no missed period counts for it
   uint32_t last_us_;
   bool is_loop_, is_unfit_;
   uint8_t frames_;

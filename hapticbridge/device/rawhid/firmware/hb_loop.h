@@ -117,7 +117,8 @@ class HbLoop {
     memset(&shown_, 0, sizeof shown_);
     memset(&report_, 0, sizeof report_);
     memset(velocity_, 0, sizeof velocity_);
-    gains_ = setting_.gains;
+    gains_ = earlier_ = setting_.gains;
+    moved_ = 1.0f;
     scene_work_ = cap_ = 0;
     age_ = silence_ = 0;
     horizon_ = lead_ = 0.0f;
@@ -127,6 +128,10 @@ class HbLoop {
 
   // Sets gains and times; the gains move there within `fade`.
   void set(const HbSetting& setting) {
+    if (memcmp(&setting.gains, &setting_.gains, sizeof setting.gains) != 0) {
+      earlier_ = gains_;
+      moved_ = 0.0f;
+    }
     setting_ = setting;
     // the tank holds twice what the spring has at its level, F^2/2K, and what is under way
     const HbGains& gains = setting.gains;
@@ -140,17 +145,20 @@ class HbLoop {
     setting_.is_enabled = false;
     share_ = 0.0f;
     memset(&gains_, 0, sizeof gains_);
+    earlier_ = gains_;
     if (report_.tank > 0) report_.tank = 0;
     has_shown_ = false;
   }
 
-  // Shows the tool. `placed`: it was put there, and the force begins anew.
+  // Shows the tool. `placed`: it was put there, and the force begins anew, without what was left in
+  // the tank for another one.
   void show(const HbShown& shown, bool placed) {
     const float since = fminf((float)(silence_ < 1 ? 1 : silence_) * period_, HB_SLOWEST);
     HbEnergy taken = shown.work - scene_work_;
     if (placed) {  // it may be another scene, which gives back nothing that this one took
       taken = positive(shown.work) - positive(scene_work_);
       if (taken < 0) taken = 0;
+      if (report_.tank > 0) report_.tank = 0;
     }
     report_.tank -= taken;
     scene_work_ = shown.work;
@@ -272,9 +280,11 @@ class HbLoop {
     share_ = is_on ? fminf(share_ + pace, 1.0f) : fmaxf(share_ - pace, 0.0f);
     if (is_placed_ && share_ == 0.0f) is_placed_ = false;
     const HbGains before = gains_;
-    approach(gains_.stiffness, share_ * setting_.gains.stiffness, pace, setting_.gains.stiffness);
-    approach(gains_.damping, share_ * setting_.gains.damping, pace, setting_.gains.damping);
-    approach(gains_.level, share_ * setting_.gains.level, pace, setting_.gains.level);
+    // all in proportion: between two couplings that the device bears lie only such
+    moved_ = fminf(moved_ + pace, 1.0f);
+    gains_.stiffness = between(earlier_.stiffness, setting_.gains.stiffness);
+    gains_.damping = between(earlier_.damping, setting_.gains.damping);
+    gains_.level = between(earlier_.level, setting_.gains.level);
     report_.share = share_;
     if (gains_.stiffness <= before.stiffness && gains_.level <= before.level) return;
     float stretch[3];
@@ -286,9 +296,8 @@ class HbLoop {
     for (int i = 0; i < 3; i++) report_.tool[i] = report_.position[i] - kept * stretch[i];
   }
 
-  static void approach(float& value, float goal, float pace, float whole) {
-    const float most = pace * fmaxf(whole, value);
-    value += fmaxf(fminf(goal - value, most), -most);
+  float between(float earlier, float goal) const {
+    return (1.0f - moved_) * earlier + moved_ * share_ * goal;
   }
 
   // Finds y*: where the tool is by now, moved out of the planes.
@@ -360,12 +369,12 @@ class HbLoop {
 
   const float period_, rate_;
   HbSetting setting_;
-  HbGains gains_;
+  HbGains gains_, earlier_;  // in force, and when they were set anew
   HbShown shown_;
   HbReport report_;
   HbEnergy scene_work_, cap_;
   float from_[3], velocity_[3], handle_step_[3];
-  float horizon_, lead_, share_;
+  float horizon_, lead_, share_, moved_;
   int32_t age_, silence_;
   bool has_started_, has_credit_, has_shown_, is_placed_;
 };

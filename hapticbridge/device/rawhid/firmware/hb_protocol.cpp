@@ -137,6 +137,7 @@ bool HbDevice::receive(const uint8_t frame[HB_FRAME_BYTES], uint32_t now_us) {
     command_.received_us = now_us;
     command_.has_expired = false;
     is_loop_ = false;
+    memset(&order_.setting, 0, sizeof order_.setting);  // a later host has its own
   } else if (!take_order(frame)) {
     return false;
   }
