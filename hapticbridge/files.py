@@ -1,9 +1,10 @@
-"""Files: atomic replacement, folders proven writable, JSON without NaN, optional packages."""
+"""Files: atomic replacement, folders proven writable, JSON without NaN, HDF5, extras."""
 
 from __future__ import annotations
 
 import errno
 import importlib
+import io
 import json
 import math
 import os
@@ -121,6 +122,16 @@ def check_target(path: Path, error: type[HapticBridgeError]) -> None:
         raise error(f"cannot write '{path}': {reason_of(found, path)}") from None
 
 
+def check_regular(path: Path, error: type[HapticBridgeError]) -> None:
+    """Checks that a path leads to a regular file, or to nothing yet; a pipe is not replaced.
+
+    Raises:
+        HapticBridgeError: ``error``.
+    """
+    if path.exists() and not path.is_file():
+        raise error(f"cannot write '{path}': it exists and is not a file")
+
+
 _LIMITS = {
     errno.EFBIG: "'ulimit -f' allows no larger file",
     errno.EMFILE: "'ulimit -n' allows no more open files; 256 suffice",
@@ -194,3 +205,84 @@ def prepared_folder(folder: Path, names: Collection[str] = ()) -> Path:
         reason = reason_of(error, path) if isinstance(error, OSError) else str(error)
         raise StudyError(f"cannot write '{path}': {reason}") from None
     return folder
+
+
+# HDF5
+
+
+class _EnduringFile(io.FileIO):
+    """File that keeps its first failure to write, and writes nothing after it.
+
+    HDF5 crashes the process if a write fails while it closes a file. Here every write seems to
+    succeed.
+
+    Attributes:
+        failure: The first failure; None without one.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "w+")
+        self.failure: OSError | None = None
+
+    def write(self, data: Any, /) -> int:
+        """Writes all bytes, unless a write failed; returns their number in any case."""
+        rest = memoryview(data).cast("B")
+        size = len(rest)
+        try:
+            while self.failure is None and rest:
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self.failure = error
+        return size
+
+    def truncate(self, size: int | None = None, /) -> int:
+        """Sets the file's size, unless a write failed; returns the size asked for."""
+        try:
+            return super().truncate(size) if self.failure is None else size or 0
+        except OSError as error:
+            self.failure = error
+            return size or 0
+
+
+class Hdf5File:
+    """New HDF5 file that survives a full disk: ``check`` and ``close`` raise what failed.
+
+    Args:
+        path: The file.
+        purpose: What needs h5py, in words.
+        error: Raised if h5py is not installed.
+        options: Options of ``h5py.File``.
+
+    Attributes:
+        root: The open file of h5py.
+
+    Raises:
+        OSError: The file cannot be made.
+        HapticBridgeError: ``error``.
+    """
+
+    def __init__(
+        self, path: Path, purpose: str, error: type[HapticBridgeError], **options: Any
+    ) -> None:
+        h5py = import_extra("h5py", purpose, "hdf5", error)
+        self._file = _EnduringFile(path)
+        self.root = h5py.File(self._file, "w", **options)
+
+    def check(self) -> None:
+        """Checks that everything could be written so far.
+
+        Raises:
+            OSError: Something could not be written.
+        """
+        if self._file.failure is not None:
+            raise self._file.failure
+
+    def close(self) -> None:
+        """Finishes the file.
+
+        Raises:
+            OSError: Something could not be written.
+        """
+        self.root.close()
+        self._file.close()
+        self.check()

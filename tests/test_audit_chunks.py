@@ -240,3 +240,14 @@ def test_a_file_that_lost_its_end_says_so_through_repairs_and_exports(
     assert "had lost its end and was repaired" in page.read_text()
     export(run, "csv", tmp_path / "piece.csv", overwrite=True)
     assert "incomplete" not in (tmp_path / "piece.csv.json").read_text()
+
+
+def test_damage_that_takes_the_metadata_along_is_the_reason(run: Path, tmp_path: Path) -> None:
+    data, path = bytearray(run.read_bytes()), tmp_path / "torn.mcap"
+    length = slice(len(MCAP0_MAGIC) + 1, len(MCAP0_MAGIC) + 9)  # of the first record
+    data[length] = (1 << 63).to_bytes(8, "little")
+    path.write_bytes(data)
+    report = audit(path)
+    assert (report.verdict, report.duration) == ("invalid", 0.0)
+    assert report.reason.startswith("the file is damaged: nothing can be read from byte 8 to byte")
+    assert report.reason.endswith("the metadata record 'hapticbridge' is missing")

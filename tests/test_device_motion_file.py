@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import zstandard
 from audit_cases import recorded
-from mcap.writer import IndexType
+from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -193,6 +193,30 @@ def test_a_bag_that_compresses_each_message_is_told(tmp_path: Path) -> None:
     (file,) = bag(tmp_path / "packed", {"/hand": packed}).glob("*.mcap")
     with pytest.raises(DeviceError, match="the bag compresses each message; 'ros2 bag convert'"):
         open_device(f"trajectory:{file}")
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_bag_with_a_changed_byte_is_refused_or_gives_the_same_motion(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    path = tmp_path / "hand.mcap"
+    with path.open("wb") as file:
+        writer: Any = McapWriter(file, compression=compression)
+        writer.start("ros2", "a test")
+        schema = writer.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", b"")
+        channel = writer.register_channel("/hand", "cdr", schema)
+        for time, data in ramp():
+            writer.add_message(channel, time, data, time)
+        writer.finish()
+    whole, right = path.read_bytes(), read_bag(path).table
+    refused = 0
+    for place in range(8, len(whole), 3):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0x10]) + whole[place + 1 :])
+        try:
+            np.testing.assert_array_equal(read_bag(path).table, right)
+        except DeviceError:
+            refused += 1
+    assert refused > 20
 
 
 def test_times_that_do_not_increase_are_told_apart(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import csv
 import importlib
 import json
 import math
+import os
 import re
 import subprocess
 import sys
@@ -167,6 +168,22 @@ def test_file_that_exists_is_kept_unless_it_may_be_replaced(recording: Path, cal
     assert code == 0
     assert f"{COUNT} ticks, 3 events" in out
     assert len(target.read_text().splitlines()) == COUNT + 1
+
+
+def test_a_link_is_followed_and_a_pipe_is_not_replaced(recording: Path, call: Called) -> None:
+    folder = recording.with_name("elsewhere")
+    folder.mkdir()
+    real, link = folder / "real.csv", recording.with_name("link.csv")
+    real.write_text("old")
+    link.symlink_to(real)
+    assert call("export", recording, "--format", "csv", "--out", link, "--overwrite")[0] == 0
+    assert link.is_symlink()
+    assert len(real.read_text().splitlines()) == COUNT + 1
+    pipe = recording.with_name("pipe.csv")
+    os.mkfifo(pipe)
+    code, _, err = call("export", recording, "--format", "csv", "--out", pipe, "--overwrite")
+    assert (code, "it exists and is not a file" in " ".join(err.split())) == (2, True)
+    assert pipe.is_fifo()
 
 
 def test_hdf5_keeps_no_more_chunks_than_it_writes(

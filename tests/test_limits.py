@@ -73,6 +73,45 @@ def test_too_small_files_are_one_sentence(tmp_path: Path, size: int) -> None:
     assert size > 5_000_000 or "'ulimit -f' allows" in done.stderr
 
 
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "run.mcap"
+    with hb.Bridge("point_mass", clock=hb.SimulatedClock(), recording=path) as bridge:
+        bridge.run(duration=3.0)
+    return path
+
+
+FORMATS = {
+    "csv": ".csv", "parquet": ".parquet", "hdf5": ".h5", "rerun": ".rrd", "lerobot": "",
+    "robomimic": "",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("share", [0.01, 0.5, 0.995])
+def test_an_export_that_has_no_room_is_one_sentence_and_leaves_nothing(
+    recording: Path, tmp_path: Path, form: str, share: float
+) -> None:
+    command = [*PROGRAM, "export", str(recording), "--format", form, "--out"]
+    whole, part = (tmp_path / f"{name}{FORMATS[form]}" for name in ("whole", "part"))
+    subprocess.run([*command, str(whole)], check=True, capture_output=True, timeout=300)
+    files = [whole] if whole.is_file() else [each for each in whole.rglob("*") if each.is_file()]
+    size = int(share * max(each.stat().st_size for each in files))
+    done = subprocess.run(
+        [*command, str(part)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)),
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert (done.returncode, len(errors)) == (2, 1), done.stderr
+    assert "File too large" in done.stderr
+    assert [each for each in tmp_path.iterdir() if not each.name.startswith("whole")] == []
+
+
 def other_user(number: int) -> tuple[str, ...]:
     """Returns a command that runs another as a user whom the limit on processes binds.
 

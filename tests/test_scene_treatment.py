@@ -478,10 +478,11 @@ def test_what_is_replaced_moves_otherwise_and_is_said(tmp_path: Path, setting: s
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_adhesion_pulls_from_as_far_as_is_said(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("floor", "more"), [('adhesion="3"', ""), ("", SUCK)])
+def test_adhesion_pulls_from_as_far_as_is_said(tmp_path: Path, floor: str, more: str) -> None:
     line = "adhesion: from the file's gap on → from 1 mm before it"
     for height, is_held in ((".0508", True), (".0515", False)):
-        text = on_floor('adhesion="3"', "", height, option=LIFT.format(5))
+        text = on_floor(floor, "", height, more, LIFT.format(5))
         ours, _ = moved(tmp_path / "sticky.xml", text, "rigid")
         assert (ours[2] < 0.051) == is_held
         scene, _ = run_model(tmp_path / "sticky.xml", "rigid")

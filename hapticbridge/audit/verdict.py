@@ -478,8 +478,8 @@ def verdict_on(
                     outcome = replayed()
                     report = replace(report, agreement=outcome.agreement, obstacle=outcome.obstacle)
                     fault = _replay_fault(outcome)
-    except RecordingError as error:
-        fault = Fault(str(error))
+    except RecordingError as error:  # what is damaged may lack metadata
+        fault = file_fault(recording) if recording.problems else Fault(str(error))
     gap = f"the run was {report.resimulation}; in its records alone" if report.obstacle else ""
     if report.trip and report.trip.is_unsound:
         gap = "MuJoCo could not simulate the scene to the end; until then"

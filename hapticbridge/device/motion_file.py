@@ -12,6 +12,7 @@ from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from zstandard import ZstdError
 
 from hapticbridge.device.base import USUAL_SPEED_LIMIT
 from hapticbridge.device.trajectory import (
@@ -222,7 +223,7 @@ def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
 
 POSE = "geometry_msgs/msg/PoseStamped"
 
-_DAMAGED = ValueError, RuntimeError, EOFError
+_DAMAGED = ValueError, RuntimeError, EOFError, OverflowError, MemoryError, ZstdError
 """Errors besides its own with which the package mcap meets a damaged file."""
 
 
@@ -246,7 +247,8 @@ def read_bag(path: Path, topic: str = "") -> Motion:
         topic: The topic; it may be empty if there is only one of ``PoseStamped``.
 
     Raises:
-        DeviceError: The file cannot be read, has no such topic, or a message is not valid.
+        DeviceError: The file cannot be read, a checksum of it does not match, it has no such topic,
+            or a message is not valid.
     """
     # imported here, because no other device needs it
     from mcap.exceptions import McapError  # noqa: PLC0415
@@ -272,13 +274,15 @@ def read_bag(path: Path, topic: str = "") -> Motion:
     stamps, logged, numbers = [], [], []
     with path.open("rb") as file:
         try:
-            reader = make_reader(file) if _index(file) else NonSeekingReader(file)
+            has_chunks = (index := _index(file)) is not None and index.chunk_indexes
+            make = make_reader if has_chunks else NonSeekingReader
+            reader = make(file, validate_crcs=True)
             for _, _, message in reader.iter_messages([topic], log_time_order=False):
                 stamp, pose = _pose_of(message.data)
                 stamps.append(stamp)
                 logged.append(message.log_time)
                 numbers.append(pose)
-        except (McapError, struct.error, LookupError, *_DAMAGED) as error:
+        except (OSError, McapError, struct.error, LookupError, *_DAMAGED) as error:
             reason = str(error) or type(error).__name__
             raise DeviceError(
                 f"{path}: message {len(stamps)} of {topic} cannot be read ({reason})"
@@ -313,7 +317,7 @@ def _topics(path: Path) -> Iterator[tuple[str, str]]:
                 channels = [each for each in records if isinstance(each, Channel)]
                 schemas = {each.id: each for each in records if isinstance(each, Schema)}
     except (OSError, McapError, struct.error, *_DAMAGED) as error:
-        reason = str(error) if _ends_whole(path) else _NO_END
+        reason = (str(error) or type(error).__name__) if _ends_whole(path) else _NO_END
         raise DeviceError(f"{path}: cannot be read ({reason})") from None
     for channel in channels:
         schema = schemas.get(channel.schema_id)

@@ -26,7 +26,7 @@ from hapticbridge.arguments import check_fields, option
 from hapticbridge.audit.recorded_scene import load_machine_code, machine_code_for, seconds_for
 from hapticbridge.confinement import MEMORY, Confined, ForeignSceneError, Fresh, Work, Worker
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.files import check_target, install_command, reason_of
+from hapticbridge.files import check_regular, check_target, install_command, reason_of
 from hapticbridge.kernel import jit
 from hapticbridge.kernel.codes import added_actuators
 from hapticbridge.kernel.record import TICK_DTYPE, Timeline
@@ -239,8 +239,7 @@ def _check_target(target: Path, shot: Shot) -> None:
             f"'{target}' is neither a picture nor a film; endings: {', '.join(ENDINGS)}"
         )
     check_target(target, HapticBridgeError)
-    if target.exists() and not target.is_file():
-        raise HapticBridgeError(f"cannot write '{target}': it exists and is not a file")
+    check_regular(target, HapticBridgeError)
     if ending != ".png" and shot.at is not None:
         raise HapticBridgeError("a time goes with a picture (.png); a film has start and stop")
     if ending == ".png" and shot.is_of_film:

@@ -266,7 +266,8 @@ class Scene:
         self.model.pair_gap += more
         self.model.flex_gap += more
         self._set_margins()
-        if self.model.flg_adhesion:
+        pulls = self.model.actuator_trntype == mujoco.mjtTrn.mjTRN_BODY  # adhesion alone has it
+        if self.model.flg_adhesion or np.any(pulls):
             # each of two geoms has it
             words = (
                 f"adhesion: from the file's gap on → from {format_si(2 * distance, 'm')} before it"

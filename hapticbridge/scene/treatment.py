@@ -137,7 +137,8 @@ TREATMENTS: dict[str, Treatment] = {
         "a contact is seen before it closes; it rests where the file says", is_rigid=True,
     ),
     "adhesion": Treatment(
-        "geom, pair", "adhesion", "changed", "from as much farther as the gap is wider; said",
+        "geom, pair", "adhesion", "changed",
+        "from as much farther as the gap is wider, also an actuator's; said",
         "contacts are seen ahead, and no port meters the pull",
     ),
     "gap": Treatment(

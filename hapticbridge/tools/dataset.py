@@ -22,6 +22,7 @@ import io
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -30,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
-from hapticbridge.files import import_extra, reason_of
+from hapticbridge.files import Hdf5File, import_extra, reason_of
 from hapticbridge.kernel.record import force_on_hand
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.ros_messages import axes_of
@@ -130,8 +131,11 @@ class Writer(Protocol):
     def add(self, episode: Episode) -> None:
         """Appends an episode."""
 
+    def finish(self) -> None:
+        """Writes what is of the whole set, after its last episode."""
+
     def close(self) -> None:
-        """Finishes the data set."""
+        """Closes open files, also of a set that is not finished."""
 
 
 # LeRobot
@@ -219,7 +223,10 @@ class LeRobotWriter:
         self._frames += count
 
     def close(self) -> None:
-        """Implements ``Writer.close``."""
+        """Implements ``Writer.close``: none is open."""
+
+    def finish(self) -> None:
+        """Implements ``Writer.finish``."""
         episodes = {name: [each[name] for each in self._episodes] for name in self._episodes[0]}
         self._write(
             _EPISODES.format(chunk_index=0, file_index=0),
@@ -332,9 +339,8 @@ class RobomimicWriter:
     """
 
     def __init__(self, folder: Path, shot: Shot, task: str) -> None:
-        h5py = import_extra("h5py", "a robomimic data set", "hdf5", RecordingError)
-        self._file, self._shot = h5py.File(folder / ROBOMIMIC_FILE, "w"), shot
-        self._data = self._file.create_group("data")
+        self._file = Hdf5File(folder / ROBOMIMIC_FILE, "a robomimic data set", RecordingError)
+        self._data, self._shot = self._file.root.create_group("data"), shot
         self._data.attrs["task"] = task
         self._actions: list[NDArray[np.float32]] = []
         self._total = 0
@@ -365,9 +371,14 @@ class RobomimicWriter:
             self._data.attrs["env_args"] = json.dumps(about)
         self._actions.append(episode.values[ACTION])
         self._total += count
+        self._file.check()
 
     def close(self) -> None:
         """Implements ``Writer.close``."""
+        self._file.close()
+
+    def finish(self) -> None:
+        """Implements ``Writer.finish``."""
         low = np.min([actions.min(axis=0) for actions in self._actions], axis=0)
         high = np.max([actions.max(axis=0) for actions in self._actions], axis=0)
         offset = (0.5 * (low + high)).astype(np.float32)
@@ -380,8 +391,7 @@ class RobomimicWriter:
         self._data.attrs["action_names"] = [*POSE, *WRENCH]
         self._data.attrs["total"] = self._total
         demos = [f"demo_{number}".encode() for number in range(len(self._actions))]
-        self._file["mask/train"] = demos
-        self._file.close()
+        self._file.root["mask/train"] = demos
 
 
 def _frames(pictures: Sequence[bytes]) -> NDArray[np.uint8]:
@@ -448,10 +458,11 @@ def write_dataset(
         shutil.rmtree(draft, ignore_errors=True)
         draft.mkdir()
         writer = DATASETS[form](draft, shot, task or recordings[0].meta.get("scene", ""))
-        for episode in _episodes(recordings, shot, progress):
-            writer.add(episode)
-            counts.append(len(episode))
-        writer.close()
+        with closing(writer):
+            for episode in _episodes(recordings, shot, progress):
+                writer.add(episode)
+                counts.append(len(episode))
+            writer.finish()
         draft.rename(folder)
     except OSError as error:
         raise RecordingError(f"cannot write '{folder}': {reason_of(error, folder)}") from None

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import ctypes
 import json
 import math
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -15,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
-from hapticbridge.files import import_extra, reason_of
+from hapticbridge.files import Hdf5File, check_regular, import_extra, reason_of
 from hapticbridge.kernel.record import (
     FLAG_LEGEND,
     TICK_DTYPE,
@@ -111,15 +113,15 @@ class Hdf5Sink:
 
     def __init__(self, path: Path, recording: RecordingFile, columns: TableColumns) -> None:
         h5py = import_extra("h5py", "HDF5", "hdf5", RecordingError)
-        self._file = h5py.File(path, "w", rdcc_nbytes=_CACHE)
-        text = h5py.string_dtype()
-        meta = self._file.create_group("meta")
+        self._file = Hdf5File(path, "HDF5", RecordingError, rdcc_nbytes=_CACHE)
+        text, root = h5py.string_dtype(), self._file.root
+        meta = root.create_group("meta")
         for key, value in recording.meta.items():
             # a slash in the name would create a group
             meta.create_dataset(key.replace("/", "_"), data=value, dtype=text)
         events = [json.dumps(event) for event in recording.events]
-        self._file.create_dataset("events", (len(events),), text, data=events)
-        ticks = self._file.create_group("ticks")
+        root.create_dataset("events", (len(events),), text, data=events)
+        ticks = root.create_group("ticks")
         self._count = 0
         self._columns, self._sets = columns, []
         for (name, unit), kind in zip(
@@ -139,6 +141,7 @@ class Hdf5Sink:
             data.resize((end,))
             data[self._count :] = values
         self._count = end
+        self._file.check()
 
     def close(self) -> None:
         """Implements ``Sink.close``."""
@@ -205,6 +208,17 @@ AXIS = 0.01
 PATH_EVERY = 16
 """Ticks between two points of the tool's path."""
 
+_FOOTER = b"RRF2FOOT"
+"""Mark in the last 16 bytes of a whole file of rerun. Its writer may fail without an error here."""
+
+_START = 1 << 16
+"""Bytes that must have room before rerun's writer starts; on a full disk it may wait forever."""
+
+_FLUSH_TIME = 20.0
+"""Longest wait in s for rerun's writer, which may end without an answer. A block takes 0.1 s."""
+
+_IN_PART = "rerun wrote a part of it only; its own line above has the reason, or the disk is full"
+
 _PATH = (128, 128, 128)
 _FORCES = {"on_hand": (230, 97, 0), "on_tool": (26, 95, 180)}
 _CLOCK = "time"
@@ -222,10 +236,11 @@ class RerunSink:
 
     def __init__(self, path: Path, recording: RecordingFile, columns: TableColumns) -> None:
         self._rerun = import_extra("rerun", "a file for rerun", "rerun", RecordingError)
-        self._path: list[NDArray[np.float64]] = []
+        self._target, self._path = path, list[NDArray[np.float64]]()
         self._period, self._axes = recording.period, axes_of(recording.meta)
         name = f"hapticbridge: {recording.meta.get('scene', '')}"
         self._stream = self._rerun.RecordingStream(name)
+        path.write_bytes(bytes(_START))
         self._stream.save(path, default_blueprint=self._blueprint())
         log = self._stream.log
         for frame in (HANDLE, TOOL):
@@ -266,14 +281,27 @@ class RerunSink:
         for energy in ENERGIES:
             column = rr.Scalars.columns(scalars=np.ascontiguousarray(ticks[energy]))
             send(f"energy/{energy}", clock, column)
+        self._flush()
 
     def close(self) -> None:
         """Implements ``Sink.close``."""
         if self._path:
             path = self._rerun.LineStrips3D([np.concatenate(self._path)], colors=[_PATH])
             self._stream.log("scene/path", path, static=True)
-        self._stream.flush()
+        self._flush()
         self._stream.disconnect()
+        with self._target.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - 16))
+            if _FOOTER not in file.read():
+                raise OSError(_IN_PART)
+
+    def _flush(self) -> None:
+        try:
+            self._stream.flush(timeout_sec=_FLUSH_TIME)
+        except RuntimeError:  # its writer's thread has ended
+            # releasing the stream would wait for that thread, perhaps for ever
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._stream))
+            raise OSError(_IN_PART) from None
 
     def _blueprint(self) -> Any:
         views = import_extra("rerun.blueprint", "a file for rerun", "rerun", RecordingError)
@@ -481,9 +509,11 @@ def export(
             raise RecordingError(f"'{file}' is the recording itself; choose another file")
         if file.exists() and not overwrite:
             raise RecordingError(f"'{file}' exists; choose another file or add --overwrite")
+        check_regular(file, RecordingError)
     piece, count = _piece(recording, span), 0
     columns = _columns(recording, form, part)
-    draft = target.with_name(f".{target.name}.draft")
+    place = target.resolve()
+    draft = place.with_name(f".{place.name}.draft")
     drafts = (draft, sidecar_of(draft)) if form == "csv" else (draft,)
     try:
         sink = sink_type(draft, piece, columns)
@@ -496,7 +526,7 @@ def export(
         if not count and span != EVERYTHING:
             raise RecordingError(_no_tick(recording, span))
         for written, file in zip(drafts, files, strict=True):
-            written.replace(file)
+            written.replace(file.resolve())  # a link is followed
     except OSError as error:
         raise RecordingError(f"cannot write '{target}': {reason_of(error, target)}") from None
     finally:
