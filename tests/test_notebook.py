@@ -10,7 +10,6 @@ import pytest
 
 import hapticbridge as hb
 
-
 ASKED = "_repr_html_"
 """Method that notebooks ask a result for."""
 
