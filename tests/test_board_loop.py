@@ -558,3 +558,19 @@ def test_gains_on_their_way_ask_no_more_of_a_device_than_their_ends(library: cty
     found = demands(1000)
     assert max(found) < 1.001 * bound
     assert found[-1] == pytest.approx(bound, rel=1e-3)
+
+
+def test_a_lost_frame_makes_no_energy_of_another_scenes_work(library: ctypes.CDLL) -> None:
+    """The scene of the last run took 5 mJ; this one took none, and its first tool was lost."""
+    board = Board(library)
+    assert board.send(setting_frame(1, SETTING))
+    for sequence, work in ((2, 0.0), (3, 5e-3)):
+        assert board.send(*show_frames(sequence, ShownTool((0.0,) * 3, None, work), 50))
+        board.run(20)
+    assert board.send(force_frame(4, (0.0,) * 6, 50))
+    board.run(1)
+    assert board.send(setting_frame(6, SETTING))
+    for sequence in (7, 8):
+        assert board.send(*show_frames(sequence, ShownTool((0.0,) * 3), 50))
+        board.run(1)
+    assert board.state().tank <= 0.0

@@ -51,7 +51,7 @@ class Bench:
         mechanics = SimulatedDevice(
             hand=hand, mass=own.mass, damping=own.damping, friction=own.friction
         )
-        self.board = LoopBoard(library, mechanics, own, link)
+        self.mechanics, self.board = mechanics, LoopBoard(library, mechanics, own, link)
         self.seam = HidSeam(self.board)
         self.device = self.opened(**options)
 
@@ -229,6 +229,8 @@ def test_periods_that_the_board_misses_count(library: ctypes.CDLL) -> None:
     assert summary.certification.is_by_time
     assert not summary.is_certified
     assert "10 kHz" in str(summary)
+    assert "--realtime" not in str(summary)
+    assert "less work for the board" in str(summary)
 
 
 def reports(*rows: tuple[int, float, float, float]) -> Any:
@@ -374,3 +376,65 @@ def test_counters_of_a_board_may_begin_anew(library: ctypes.CDLL) -> None:
     tally.add(reports(), {"changes": 3.0, "ticks": 20, "missed": 4})
     own = tally.account
     assert (own.periods, own.missed, own.changes) == (30, 1, 2.0)
+
+
+class Leaving:
+    """A hand that goes with a scene, and then gives way to the force at a constant speed."""
+
+    def __init__(self, hand: SimulatedDevice, period: float, leaves_at: float) -> None:
+        self._hand, self._step, self._left = hand, 0.1 * period, round(leaves_at / period)
+        self._towards, self._place = np.zeros(3), np.zeros(3)
+
+    def start(self, period: float) -> Any:
+        return self._hand.start(period)
+
+    def write(self, wrench: Any) -> None:
+        if self._left > 0:
+            self._hand.write(wrench)
+            self._towards = np.array(wrench[:3]) / max(float(np.linalg.norm(wrench[:3])), 1e-9)
+
+    def read(self, sample: Any) -> None:
+        self._left -= 1
+        if self._left > 0:
+            self._hand.read(sample)
+            self._place = sample["position"][0].copy()
+        else:
+            self._place += self._step * self._towards
+            sample["position"][0] = self._place
+
+
+class Stalling(DrivingClock):
+    """Time in which a host does nothing for ``stall`` s, once."""
+
+    stall = 0.0
+
+    def wait(self) -> tuple[int, int, int]:
+        period = super().wait()[0]
+        skipped = round(self.stall / 1e-3)
+        for _ in range(skipped):
+            period = super().wait()[0]
+        self.stall = 0.0
+        return period, period, skipped
+
+
+def test_a_silence_accuses_no_board(library: ctypes.CDLL, tmp_path: Path) -> None:
+    """The host stalls for 150 ms, in which the hand leaves a wall and the force ends."""
+    bench = Bench(library)
+    leaving = Leaving(bench.mechanics, bench.board.sheet.period, 0.82)
+    bench.board = LoopBoard(library, leaving, None, 0.5e-3)  # type: ignore[arg-type]
+    bench.seam.plugged[0] = bench.board
+    bench.device, clock = bench.opened(), Stalling(bench.seam)
+
+    def stall(tick: int) -> None:
+        if tick == 800:
+            assert np.linalg.norm(bench.board.force) > 1.0
+            clock.stall = 0.15
+
+    path = tmp_path / "run.mcap"
+    with hb.Bridge(bench.scene, bench.device, clock=clock, recording=path) as bridge:
+        summary = bridge.run(1.1, stall)
+    assert summary.is_certified
+    report = hb.audit(path, in_process=True)
+    assert (report.verdict, report.agreement) == ("passive", "bit for bit")
+    assert report.certification is not None
+    assert report.certification.verdict is True

@@ -208,11 +208,12 @@ def test_what_the_guard_did_is_drawn_and_told(run_file: Path, tmp_path: Path) ->
         assert told in page.read_text(encoding="utf-8")
 
 
-def test_what_stopped_a_run_is_listed_after_any_number_of_inputs() -> None:
-    inputs = [{"event": "input", "tick": i, "time_ns": i} for i in range(2 * MAX_INPUTS)]
+@pytest.mark.parametrize("name", ["input", "shown", "own_loop"])
+def test_what_stopped_a_run_is_listed_after_any_number_of_inputs(name: str) -> None:
+    inputs = [{"event": name, "tick": i, "time_ns": i} for i in range(2 * MAX_INPUTS)]
     trip = {"event": "trip", "tick": 400, "time_ns": 400_000_000, "reason": "it jumped"}
     rows = event_rows([{"event": "start", "tick": 0, "time_ns": 0}, *inputs, trip])
-    assert [row[0] for row in rows] == ["start", *["input"] * MAX_INPUTS, "trip"]
+    assert [row[0] for row in rows] == ["start", *[name] * MAX_INPUTS, "trip"]
     assert rows[-1] == ("trip", "400", "0.400 s", "reason it jumped")
     others = [{"event": "resume", "tick": i} for i in range(2 * MAX_EVENTS)]
     assert len(event_rows([*inputs, *others])) == MAX_EVENTS

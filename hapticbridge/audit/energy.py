@@ -377,8 +377,11 @@ def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict
     rows = np.concatenate([block.state.row, ticks, block.following])
     sent = rows["wrench_on_device"][: len(ticks)].copy()
     sent[np.isin(ticks["tick"], events.resumed)] = 0.0
-    if parameters.is_apart:  # by the trapezoidal rule
-        sent = 0.5 * (sent + ticks["wrench_on_device"])
+    if parameters.is_apart:  # by the trapezoidal rule, but none in a silence or pause
+        longest = (parameters.guarding.stale_ticks + 1) * parameters.period
+        is_unknown = (block.interval > longest) | block.is_first
+        share = np.where(is_unknown, 0.0, 0.5)[:, None]
+        sent = share * (sent + ticks["wrench_on_device"])
     moved, turned = _device_motion(rows, 0, len(ticks))
     late_moved, late_turned = _device_motion(rows, delay, len(ticks))
     work = np.sum(sent[:, :3] * moved, axis=1) + np.sum(sent[:, 3:] * turned, axis=1)

@@ -234,7 +234,7 @@ class Timekeeping:
         sample_rate = (
             _sample_rate(times, parameters.period, silence is not None) if is_felt else 0.0
         )
-        remedy = _remedy(is_realtime=times.is_realtime, sample_rate=sample_rate)
+        remedy = _OWN_REMEDY if _is_own(conditions) else _remedy(times.is_realtime, sample_rate)
         late = tuple(_at_times(each, parameters, least, times, remedy) for each in conditions)
         verdicts = [each.holds for each in late if each.available is not None]
         is_known = all(each.available is not None for each in conditions if each.is_felt)
@@ -322,7 +322,9 @@ class Timekeeping:
     @property
     def remedy(self) -> str:
         """Changes that help a run to keep its time."""
-        return _remedy(is_realtime=self.is_realtime, sample_rate=self.sample_rate)
+        if _is_own(self.in_time):
+            return _OWN_REMEDY
+        return _remedy(self.is_realtime, self.sample_rate)
 
     @property
     def slowness(self) -> str:
@@ -342,7 +344,7 @@ class Timekeeping:
             return "the scene runs in slow motion: a lower --scene-rate gives its steps more time"
         if self.share == 1.0 or self.is_kept is False:
             return ""
-        if self.is_realtime:
+        if self.is_realtime or _is_own(self.in_time):
             return f"deadlines were missed: try {self.remedy}" if self.share < MANY_KEPT else ""
         return "deadlines were missed: --realtime requests the processor for the loop"
 
@@ -391,7 +393,15 @@ def _sample_rate(times: RunTimes, period: float, was_silent: bool) -> float:
     return times.new_samples / heard
 
 
-def _remedy(*, is_realtime: bool, sample_rate: float) -> str:
+def _is_own(conditions: Sequence[DampingCondition]) -> bool:
+    """Returns True if a loop of the device's own kept the time."""
+    return any(each.loop_period is not None for each in conditions)
+
+
+_OWN_REMEDY = "a lower --stiffness, or less work for the board in each of its periods"
+
+
+def _remedy(is_realtime: bool, sample_rate: float) -> str:
     if sample_rate:
         return f"--rate {sample_rate:.4g} with the stiffness left to the run"
     request = "" if is_realtime else "--realtime, "

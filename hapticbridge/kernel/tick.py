@@ -215,10 +215,16 @@ def _device_motion(pose: Part, position: Vector, quaternion: Quaternion) -> tupl
 
 
 @compiled
-def _take_mean_wrench(loop: Part) -> None:
-    """Takes the mean of a device's own wrench over the last tick, by the trapezoidal rule."""
+def _take_mean_wrench(s: State, interval: float) -> None:
+    """Takes the mean of a device's own wrench since its last new sample, by the trapezoidal rule.
+
+    In a pause, or a silence in which the force fades, the ends say nothing of it, and it counts as
+    none.
+    """
+    loop, longest = s.loop, (s.guard.stale_ticks + 1) * s.run.period
+    share = 0.0 if interval > longest or loop.tick == s.guard.start_tick else 0.5
     for i in range(6):
-        loop.wrench_on_device[i] = 0.5 * (loop.wrench_on_device[i] + loop.reported[i])
+        loop.wrench_on_device[i] = share * (loop.wrench_on_device[i] + loop.reported[i])
 
 
 @compiled
@@ -231,8 +237,10 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
         ``OK``, or the reason to refuse the sample; nothing was changed then.
     """
     pose = s.pose
+    # the device may have moved during all the time since its last new sample
+    interval = max(elapsed, s.run.period) + s.guard.time_since_sample
     if s.run.is_apart:
-        _take_mean_wrench(s.loop)
+        _take_mean_wrench(s, interval)
     position = vector_of(sample.position)
     if not _is_pose(position, quaternion_of(sample.quaternion)):
         return BAD_SAMPLE
@@ -243,8 +251,6 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
     code = refusal(s, moved, turned, elapsed)
     if code != OK:
         return code
-    # the device may have moved during all the time since its last new sample
-    interval = max(elapsed, s.run.period) + s.guard.time_since_sample
     ticks = s.guard.consecutive_stale + 1
     observe_energy(s, moved, turned, interval)
     meter_device(s, moved, turned, interval)

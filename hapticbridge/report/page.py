@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
 from hapticbridge.demand.guard import CONTROLLERS
+from hapticbridge.demand.own_loop import EVENT as OWN_LOOP_EVENT
 from hapticbridge.device import DATA_SHEET_UNITS
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import atomic_write, check_target, read_json, reason_of
 from hapticbridge.kernel.record import TickFlag, due_times
 from hapticbridge.plotting import inline_svg
 from hapticbridge.recording import Recording
+from hapticbridge.recording.format import SHOWN_EVENT
 from hapticbridge.report.cause import excess_of, pump_behind_trip
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.plots import (
@@ -41,8 +43,11 @@ MAX_EVENTS = 200
 """Largest number of events on a page."""
 
 MAX_INPUTS = 10
-"""Largest number of inputs among them. A run with scripted inputs has one per tick, which would
-hide all other events."""
+"""Largest number of inputs and reports among them. A run with scripted inputs has one per tick,
+which would hide all other events."""
+
+_REPEATED = ("input", SHOWN_EVENT, OWN_LOOP_EVENT)
+"""Events that a run has all the time."""
 
 _LONGEST = 200
 """Largest number of characters of an event; an input lists every number that it wrote."""
@@ -233,10 +238,10 @@ def percent(is_on: NDArray[np.bool_]) -> str:
 def event_rows(events: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str, str]]:
     """Returns name, tick, time and details of events, in their order.
 
-    At most ``MAX_EVENTS`` events are kept, at most ``MAX_INPUTS`` of them inputs. Inputs are
-    dropped first, because they are many and the event that stopped a run is last.
+    At most ``MAX_EVENTS`` events are kept, at most ``MAX_INPUTS`` of them inputs and reports. These
+    are dropped first, because they are many and the event that stopped a run is last.
     """
-    is_input = [event.get("event") == "input" for event in events]
+    is_input = [event.get("event") in _REPEATED for event in events]
     inputs = [index for index, each in enumerate(is_input) if each][:MAX_INPUTS]
     others = [index for index, each in enumerate(is_input) if not each]
     kept = sorted((others + inputs)[:MAX_EVENTS])

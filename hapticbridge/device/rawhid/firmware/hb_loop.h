@@ -155,7 +155,8 @@ class HbLoop {
   void show(const HbShown& shown, bool placed) {
     const float since = fminf((float)(silence_ < 1 ? 1 : silence_) * period_, HB_SLOWEST);
     HbEnergy taken = shown.work - scene_work_;
-    if (placed) {  // it may be another scene, which gives back nothing that this one took
+    const bool is_new = placed || !has_shown_;  // or the frame that placed it was lost
+    if (is_new) {  // it may be another scene, which gives back nothing that this one took
       taken = positive(shown.work) - positive(scene_work_);
       if (taken < 0) taken = 0;
       if (report_.tank > 0) report_.tank = 0;
@@ -164,7 +165,7 @@ class HbLoop {
     scene_work_ = shown.work;
     shown_ = shown;
     age_ = silence_ = 0;
-    is_placed_ = is_placed_ || placed || !has_shown_;
+    is_placed_ = is_placed_ || is_new;
     has_shown_ = true;
     if (shown.has_velocity) {
       copy(from_, shown.position);
