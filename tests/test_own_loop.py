@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import hapticbridge as hb
 from hapticbridge.demand.own_loop import REPORT_DTYPE, ROUNDING, OwnLoopTally
 from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.device.driver import ignore_message
-from hapticbridge.device.own_loop import LoopState, ShownTool
+from hapticbridge.device.own_loop import BoardSetting, LoopReport, LoopState, ShownTool
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
 from hapticbridge.device.simulated.device import hand_for
 from hapticbridge.errors import DeviceError
@@ -255,6 +256,61 @@ def test_what_a_board_cannot_have_is_left_to_the_bridge(library: ctypes.CDLL) ->
     refused = Bench(library, "point_mass")
     with refused.bridge(method="weld", i_know=True) as bridge:
         assert not bridge.setup.info.loop_period
+
+
+class Jerky:
+    """A device whose own loop reports a force at the end of each move, and none before it."""
+
+    info = hb.DeviceInfo(
+        name="jerky", axes=("x",), force_limit=10.0, damping=2.0, delay=0.0, loop_period=1e-4
+    )  # fmt: skip
+    loop_report: LoopReport | None = None
+    place = (0.0, 0.0, 0.0)
+
+    def __init__(self) -> None:
+        self.info = replace(self.info, is_real=False)
+        self.loop_state: LoopState | None = None
+        self.ticks = 0
+
+    def start(self, period: float) -> Any:
+        sample = np.zeros(1, hb.SAMPLE_DTYPE)
+        sample["quaternion"][0, 0] = 1.0
+        return sample
+
+    def read(self, sample: Any) -> int:
+        self.ticks += 1
+        phase = self.ticks % 3  # back, out with a force, out without it
+        self.place = (0.5e-3 * (phase > 0), 0.0, 0.0)
+        force = (9.0 * (phase == 1), 0.0, 0.0)
+        rest = (0.0,) * 3
+        self.loop_state = LoopState(1, self.ticks, 0, 0, self.place, rest, force, 0.0, 0.0, 0)
+        sample["position"][0], sample["quaternion"][0] = self.place, (1.0, 0.0, 0.0, 0.0)
+        return 0
+
+    def write(self, wrench: Any) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def set_loop(self, setting: BoardSetting) -> None:
+        pass
+
+    def show(self, shown: ShownTool) -> int:
+        return 0
+
+
+def test_work_between_two_samples_counts_as_the_least(tmp_path: Path) -> None:
+    """A force that is there at the end of a move may have come there."""
+    path = tmp_path / "run.mcap"
+    clock = hb.SimulatedClock()
+    with hb.Bridge("point_mass", Jerky(), clock=clock, recording=path) as bridge:
+        summary = bridge.run(0.2)
+    assert summary.hand_energy.unpaid == 0.0
+    assert summary.hand_energy.net == 0.0
+    report = hb.audit(path, in_process=True)
+    assert report.agreement == "bit for bit"
+    assert report.hand_energy.unpaid == 0.0
 
 
 def test_another_run_on_the_same_board_begins_anew(library: ctypes.CDLL, tmp_path: Path) -> None:

@@ -377,10 +377,12 @@ def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict
     rows = np.concatenate([block.state.row, ticks, block.following])
     sent = rows["wrench_on_device"][: len(ticks)].copy()
     sent[np.isin(ticks["tick"], events.resumed)] = 0.0
+    spread = np.zeros_like(sent)
     if parameters.is_apart:  # by the trapezoidal rule, but none in a silence or pause
         longest = (parameters.guarding.stale_ticks + 1) * parameters.period
         is_unknown = (block.interval > longest) | block.is_first
         share = np.where(is_unknown, 0.0, 0.5)[:, None]
+        spread = share * np.abs(sent - ticks["wrench_on_device"])
         sent = share * (sent + ticks["wrench_on_device"])
     moved, turned = _device_motion(rows, 0, len(ticks))
     late_moved, late_turned = _device_motion(rows, delay, len(ticks))
@@ -408,9 +410,10 @@ def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict
     forces = np.vstack([[before[f"sent_{axis}"] for axis in "xyz"], sent[:, :3]])
     changes = np.abs(np.diff(forces, axis=0)) + np.diff(np.abs(forces), axis=0)
     hidden = 0.5 * guarding.resolution * np.sum(changes, axis=1)
+    unknown = np.sum(spread * np.abs(np.concatenate([moved, turned], axis=1)), axis=1)
     return {
-        "hand_energy": _summed(work - burned, before["hand_energy"]),
-        "guarded_energy": _summed(work - shown - hidden, before["guarded_energy"]),
+        "hand_energy": _summed(work - burned - unknown, before["hand_energy"]),
+        "guarded_energy": _summed(work - shown - hidden - unknown, before["guarded_energy"]),
         "hidden_energy": _summed(hidden, before["hidden_energy"]),
         **{f"sent_{axis}": sent[:, i] for i, axis in enumerate("xyz")},
         "device_energy": _summed(work, before["device_energy"]),

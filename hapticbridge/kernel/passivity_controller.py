@@ -275,7 +275,8 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
             the springs' energy V_0, the coupling's work W_c and P = max(Σ E, 0); for a device with
             a loop of its own the largest of the latter part so far.
 
-    Valid for a wrench that is held constant between ticks. A certified device keeps A <= 0.
+    Valid for a wrench that is held constant between ticks, or lies between those of a device's own
+    loop at two samples, the least work of which counts. A certified device keeps A <= 0.
 
     Args:
         s: The bound state, as the previous tick left it.
@@ -314,6 +315,7 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
         earlier = observer.earlier_force[i]
         held += abs(w[i] - earlier) + abs(w[i]) - abs(earlier)
         observer.earlier_force[i] = w[i]
+        delivered -= s.loop.spread[i] * abs(moved[i]) + s.loop.spread[3 + i] * abs(turned[i])
     observer.hidden_energy += 0.5 * observer.resolution * held
     unfelt = unfelt_work(s, moved, turned)
     gained -= unfelt

@@ -176,15 +176,17 @@ LOOP_DTYPE = np.dtype(
         ("motion", "<f8", 6),
         ("wrench_on_device", "<f8", 6),
         ("reported", "<f8", 6),
+        ("spread", "<f8", 6),
         ("unfelt", "<f8", 6),
     ]
 )
 """Sub-record ``loop``, written by this module alone: results that one stage of a tick hands to the
 next. ``external_flags`` is ``STALE_SAMPLE`` as the live loop or a recording has it, set
 before the tick, and so is ``reported``, the wrench that a device with a loop of its own says that
-it had at its sample; ``has_positions`` is 1 if MuJoCo's position stage has run since the step;
-``motion`` is the tool's, in m and rad; ``unfelt`` is the wrench that axes without a motor would be
-sent; wrenches in N and N m, peaks since the start."""
+it had at its sample; ``spread`` is by how much its mean over the last tick is not known;
+``has_positions`` is 1 if MuJoCo's position stage has run since the step; ``motion`` is the tool's,
+in m and rad; ``unfelt`` is the wrench that axes without a motor would be sent; wrenches in N and N
+m, peaks since the start."""
 
 
 # Before MuJoCo's step
@@ -219,12 +221,13 @@ def _take_mean_wrench(s: State, interval: float) -> None:
     """Takes the mean of a device's own wrench since its last new sample, by the trapezoidal rule.
 
     In a pause, or a silence in which the force fades, the ends say nothing of it, and it counts as
-    none.
+    none. ``spread`` is by how much it may have been another one on the way.
     """
     loop, longest = s.loop, (s.guard.stale_ticks + 1) * s.run.period
     share = 0.0 if interval > longest or loop.tick == s.guard.start_tick else 0.5
     for i in range(6):
-        loop.wrench_on_device[i] = share * (loop.wrench_on_device[i] + loop.reported[i])
+        before, now = loop.wrench_on_device[i], loop.reported[i]
+        loop.wrench_on_device[i], loop.spread[i] = share * (before + now), share * abs(before - now)
 
 
 @compiled
