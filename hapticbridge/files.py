@@ -100,6 +100,8 @@ def reason_of(error: OSError, target: Path) -> str:
         return f"the folder {target.parent} does not exist"
     if not os.path.isdir(folder):  # noqa: PTH112 - pathlib's raises without permission
         return f"{target.parent} is not a folder"
+    if words := temporary_words(error):
+        return words
     if error.errno == errno.ENOENT:  # as in /proc
         return f"the folder {target.parent} takes no new file"
     return error.strerror or str(error)
@@ -143,6 +145,13 @@ _LIMITS = {
 def limit_words(number: int | None) -> str:
     """Returns which limit of the system an error number tells of; empty for another error."""
     return _LIMITS.get(number or 0, "")
+
+
+def temporary_words(error: OSError) -> str:
+    """Returns that no folder takes a temporary file if this is the error; else empty."""
+    if not isinstance(error, FileNotFoundError) or error.filename is not None:
+        return ""
+    return f"{error.strerror}; free space there, lift 'ulimit -f', or set TMPDIR to another folder"
 
 
 def remove_file(path: Path) -> None:

@@ -242,7 +242,9 @@ def test_a_file_that_lost_its_end_says_so_through_repairs_and_exports(
     assert "incomplete" not in (tmp_path / "piece.csv.json").read_text()
 
 
-def test_damage_that_takes_the_metadata_along_is_the_reason(run: Path, tmp_path: Path) -> None:
+def test_damage_that_takes_the_metadata_along_is_the_reason(
+    run: Path, call: Called, tmp_path: Path
+) -> None:
     data, path = bytearray(run.read_bytes()), tmp_path / "torn.mcap"
     length = slice(len(MCAP0_MAGIC) + 1, len(MCAP0_MAGIC) + 9)  # of the first record
     data[length] = (1 << 63).to_bytes(8, "little")
@@ -251,3 +253,17 @@ def test_damage_that_takes_the_metadata_along_is_the_reason(run: Path, tmp_path:
     assert (report.verdict, report.duration) == ("invalid", 0.0)
     assert report.reason.startswith("the file is damaged: nothing can be read from byte 8 to byte")
     assert report.reason.endswith("the metadata record 'hapticbridge' is missing")
+    scene = "virtual_wall"
+    for words in (
+        ("render", path, tmp_path / "x.png"),
+        ("render", path, tmp_path / "x.gif"),
+        ("compare", path, run),
+        ("compare", run, path),
+        ("view", path),
+        ("export", path, "--format", "csv", "--from", "0.1", "--out", tmp_path / "x.csv"),
+        ("run", scene, "--fast", "--device", f"trajectory:{path}"),
+        ("check", scene, "--motion", path),
+    ):
+        code, _, err = call(*map(str, words))
+        assert (code, err.count("\n")) == (2, 1), words
+        assert f"{path} is damaged: nothing can be read from byte 8" in err, words

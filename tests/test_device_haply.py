@@ -361,6 +361,9 @@ def test_no_service_socket_or_package_is_one_sentence(monkeypatch: pytest.Monkey
         open_device(f"haply:service=localhost:{port}")
     assert haply.find(("localhost", port)) == []
     assert "does not run" in haply.medium(("localhost", port))
+    for host in ("no.such.invalid", "a..b"):
+        with pytest.raises(DeviceError, match=f"^there is no host '{host}' for the Inverse Serv"):
+            open_device(f"haply:service={host}:{port}")
     with socket.create_server(("localhost", 0)) as mute:
 
         def answer() -> None:

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import sys
+import tempfile
 import threading
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from hapticbridge.files import (
     install_command,
     prepared_folder,
     read_json,
+    reason_of,
+    temporary_words,
 )
 
 
@@ -150,3 +153,15 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
     with pytest.raises(StudyError, match=r"'/proc/x': the folder /proc takes no new file$"):
         prepared_folder(Path("/proc/x"))
     assert prepared_folder(tmp_path / "new" / "more").is_dir()
+
+
+def test_without_room_for_temporary_files_that_is_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: [str(tmp_path / "no")])
+    with pytest.raises(OSError, match="No usable temporary directory") as found:
+        tempfile.gettempdir()
+    assert reason_of(found.value, tmp_path / "x").startswith("No usable temporary directory found")
+    assert "set TMPDIR" in temporary_words(found.value)
+    assert temporary_words(FileNotFoundError(2, "No such file", "x")) == ""

@@ -134,6 +134,25 @@ def test_an_ffmpeg_that_fails_is_an_error_and_what_was_there_stays(
     assert list(film.parent.iterdir()) == [film]
 
 
+# imageio-ffmpeg leaves its pipes to the garbage collector
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full is Linux's")
+def test_a_full_disk_is_the_reason_why_a_film_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="a film needs the extra 'view'")
+    program, film = tmp_path / "ffmpeg", tmp_path / "film.mp4"
+    program.write_text("#!/bin/sh\nexec cat >/dev/null")  # a film without frames remains
+    program.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    for path, reason in (("/dev/full", "No space left on device"), (film, "")):
+        frames = iter([np.zeros((48, 64, 3), dtype=np.uint8)] * 5)
+        with pytest.raises(HapticBridgeError) as refused:
+            write_film(str(path), frames, (64, 48), 30)
+        assert str(refused.value).endswith(reason)
+        assert ("No space" in str(refused.value)) == bool(reason)
+
+
 def test_a_part_of_a_run_is_filmed_as_slowly_as_asked_for(sway: Path) -> None:
     stage = Stage(sway)
     assert list(film_ticks(stage, 30))[:4] == [0, 32, 66, 99]  # frames keep the run's time

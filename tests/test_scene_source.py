@@ -432,6 +432,15 @@ def test_a_name_that_is_not_text_is_refused_in_a_sentence(tmp_path: Path) -> Non
     load_scene(path.rename(tmp_path / "n.xml"))
 
 
+def test_a_locale_without_utf_8_is_the_reason_why_a_name_cannot_be_read(tmp_path: Path) -> None:
+    path = scene_file(tmp_path, mjcf()).rename(tmp_path / "bäll.xml")
+    command = [sys.executable, "-m", "hapticbridge", "check", str(path)]
+    environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = subprocess.run(command, env=environment, capture_output=True, check=False)
+    assert done.returncode == 2
+    assert b"Python reads names as ascii here; set PYTHONUTF8=1" in done.stderr
+
+
 def test_links_within_a_scene_and_its_repository_are_followed(tmp_path: Path) -> None:
     scene = tmp_path / "repository" / "scenes" / "peg"
     scene.mkdir(parents=True)

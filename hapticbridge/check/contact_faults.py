@@ -10,7 +10,7 @@ import numpy as np
 from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.observe import clearances
 from hapticbridge.kernel.colliders import MAX_VERTICES
-from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION
+from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION, REFUSED_PENETRATION
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.contacts import (
     REFERENCE_STEPS,
@@ -314,7 +314,7 @@ def start_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             first < 0
             or second < 0
             or (first, second) in seen
-            or contact.dist >= -MAXIMUM_START_PENETRATION
+            or contact.dist >= -REFUSED_PENETRATION
         ):
             continue
         seen.add((first, second))

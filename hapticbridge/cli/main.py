@@ -172,9 +172,10 @@ def _system_fault(error: MemoryError | ImportError | OSError | RuntimeError) -> 
         if str(error) != _NO_THREAD:
             raise error
         number = errno.EAGAIN
-    from hapticbridge.files import limit_words  # noqa: PLC0415 - for an error alone
+    from hapticbridge.files import limit_words, temporary_words  # noqa: PLC0415 - for an error alone
 
-    if words := limit_words(number):
+    words = limit_words(number)
+    if words := words or (temporary_words(error) if isinstance(error, OSError) else ""):
         return _say("error", words)
     is_full = not isinstance(error, OSError) or error.errno in (None, errno.ENOMEM)
     if is_full and _is_memory_limited():

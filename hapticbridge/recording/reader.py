@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -259,6 +259,22 @@ MAX_KEPT = 1 << 17
 The files of longer runs are read once per use."""
 
 
+class LostMetadata(dict[str, str]):
+    """Metadata of a damaged file that lost them: empty, and each entry that is needed is an error.
+
+    Args:
+        path: The file.
+        problems: Its damage.
+    """
+
+    def __init__(self, path: Path, problems: Iterable[str]) -> None:
+        super().__init__()
+        self._damage = f"{path} is damaged: {'; '.join(problems)}"
+
+    def __missing__(self, name: str) -> str:
+        raise RecordingError(self._damage)
+
+
 @dataclass(frozen=True, kw_only=True)
 class RecordingFile:
     """A recording whose ticks are read from the file on request.
@@ -269,7 +285,7 @@ class RecordingFile:
         last_tick: Number of the last record's tick; -1 without records.
         flags: Union of all records' flags.
         events: Events in order, with ``event`` and ``time_ns`` (since the run's start).
-        meta: Metadata as text; empty if damaged.
+        meta: Metadata as text; ``LostMetadata`` if damaged.
         attachments: Attached files by name.
         is_cut: True if the end of the file is missing because recorder or machine died; everything
             up to the last whole chunk is available.
@@ -302,7 +318,7 @@ class RecordingFile:
         """T in s as the metadata state it; NaN if they are damaged."""
         try:
             return float(self.meta["period_s"])
-        except (KeyError, ValueError):
+        except (KeyError, ValueError, RecordingError):
             return math.nan
 
     @property
@@ -508,6 +524,8 @@ def _read_through(
     is_whole = not container.is_cut and not contents.problems
     if is_whole and (fault := contents.message_fault()):
         contents.problems.append(fault)
+    if contents.meta is None and contents.problems:
+        meta = LostMetadata(path, dict.fromkeys(contents.problems))
     facts = {
         "path": path,
         "count": min(counts[:hands]),

@@ -14,6 +14,7 @@ from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.replay import Resimulator, obstacle
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.files import limit_words
 from hapticbridge.kernel.codes import held_body
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import Timeline, force_on_hand
@@ -467,9 +468,11 @@ def write_film(path: str, frames: Iterator[Frame], size: tuple[int, int], fps: i
         film.close()
         written, _ = imageio_ffmpeg.count_frames_and_secs(path)
     except (OSError, RuntimeError) as error:
-        raise HapticBridgeError(f"ffmpeg cannot write the film: {_first_line(error)}") from None
+        reason = _refusal(path) or _first_line(error)
+        raise HapticBridgeError(f"ffmpeg cannot write the film: {reason}") from None
     if written != count:
-        raise HapticBridgeError(f"ffmpeg wrote {written} of {count} frames; is the disk full?")
+        reason = _refusal(path) or "ffmpeg gave no reason"
+        raise HapticBridgeError(f"ffmpeg wrote {written} of {count} frames: {reason}")
 
 
 COLOURS = 64
@@ -498,5 +501,22 @@ def write_animation(path: Path, frames: Iterator[Frame], fps: int) -> str:
     return ""
 
 
+_FILM_BUFFER = 1 << 18
+"""Bytes that ffmpeg holds back at most before it writes them to a film."""
+
+
+def _refusal(path: str) -> str:
+    """Returns why a file cannot grow, as on a full disk; empty if it can.
+
+    ffmpeg's own words do not tell it.
+    """
+    try:
+        with Path(path).open("ab") as film:
+            film.write(bytes(_FILM_BUFFER))
+    except OSError as error:
+        return limit_words(error.errno) or error.strerror or str(error)
+    return ""
+
+
 def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(":")

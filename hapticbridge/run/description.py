@@ -114,18 +114,24 @@ def start_of(state: NDArray[np.void], name: str) -> list[float]:
 _MAX_TICKS = 2**31
 
 
+def _meta_text(meta: Mapping[str, str], name: str) -> str:
+    try:
+        return meta[name]
+    except KeyError:
+        raise RecordingError(f"the recording's metadata lack '{name}'") from None
+
+
 def meta_float(meta: Mapping[str, str], name: str) -> float:
     """Returns a number of the metadata, equal to the last bit.
 
     Raises:
         RecordingError: It is missing, not a number or not finite.
     """
+    text = _meta_text(meta, name)
     try:
-        value = float(meta[name])
-    except KeyError:
-        raise RecordingError(f"the recording's metadata lack '{name}'") from None
+        value = float(text)
     except ValueError:
-        raise RecordingError(f"metadata '{name}' is {meta[name]!r:.80}, not a number") from None
+        raise RecordingError(f"metadata '{name}' is {text!r:.80}, not a number") from None
     if not math.isfinite(value):
         raise RecordingError(f"metadata '{name}' is {value}; it must be finite")
     return value
@@ -137,9 +143,7 @@ def meta_numbers(meta: Mapping[str, str], name: str, count: int) -> tuple[float,
     Raises:
         RecordingError: It is missing, or not ``count`` finite numbers.
     """
-    text = meta.get(name)
-    if text is None:
-        raise RecordingError(f"the recording's metadata lack '{name}'")
+    text = _meta_text(meta, name)
     try:
         values = tuple(float(value) for value in read_json(text))
     except (ValueError, TypeError, OverflowError):
@@ -305,8 +309,9 @@ def method_of(meta: Mapping[str, str]) -> Method:
 
     Raises:
         SceneError: Method or contact is unknown, or they exclude each other.
+        RecordingError: The method is missing.
     """
-    return method_named(meta.get("method", "")).with_contact(meta.get("contact", ""))
+    return method_named(_meta_text(meta, "method")).with_contact(meta.get("contact", ""))
 
 
 def _effective(meta: Mapping[str, str], method: Method) -> Coupling | None:

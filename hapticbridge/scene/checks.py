@@ -230,6 +230,10 @@ MAXIMUM_START_PENETRATION = 1e-4
 releases energy that no port meters: 26 mJ within 15 ms were measured. A larger value allows a
 larger push at the start."""
 
+REFUSED_PENETRATION = MAXIMUM_START_PENETRATION + 5e-7
+"""Penetration of the tool at the start, in m, beyond which it is refused: the largest allowed one
+rounded to 1 um, as messages print it. A start at the limit itself computes to either side of it."""
+
 NOTABLE_OVERLAP = 1e-3
 """Overlap in m at the start above which a scene is changed, or a sentence says that it begins so.
 MuJoCo's own contacts rest 0.1 mm deep, and soft ones deeper; rigid contacts hold these silently."""
@@ -499,7 +503,7 @@ def refuse_overlap(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> Non
         SceneError: Names the deepest pair.
     """
     root = model.body_rootid[model.site(grip).bodyid[0]]
-    for overlap in overlaps(model, data, MAXIMUM_START_PENETRATION):
+    for overlap in overlaps(model, data, REFUSED_PENETRATION):
         if root in [model.body_rootid[body] for body in overlap.bodies if body >= 0]:
             raise SceneError(
                 f"the tool starts in penetration: {overlap}; contacts of the scene allow at most "

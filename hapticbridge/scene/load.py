@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -204,7 +206,7 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
     try:
         str(path).encode()
     except UnicodeEncodeError:
-        raise SceneError(f"cannot read scene '{path}': MuJoCo needs a name in UTF-8") from None
+        raise SceneError(f"cannot read scene '{path}': {_name_fault(path)}") from None
     if path.suffix.lower() in _MESHES:
         raise SceneError(
             f"scene '{path}' is a mesh; write an MJCF file that names it in <mesh name=… file=…/>"
@@ -219,6 +221,16 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
     check_numbers(sources)
     values = apply_parameters(spec, path, parameters)
     return SceneSource(path, spec, sources, values)
+
+
+def _name_fault(path: Path) -> str:
+    """Returns why a name that is no Unicode text cannot be read."""
+    try:
+        os.fsencode(path).decode()
+    except UnicodeDecodeError:
+        return "MuJoCo needs a name in UTF-8"
+    encoding = sys.getfilesystemencoding()
+    return f"Python reads names as {encoding} here; set PYTHONUTF8=1, or a locale with UTF-8"
 
 
 def spec_source(spec: mujoco.MjSpec) -> SceneSource:

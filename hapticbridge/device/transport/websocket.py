@@ -84,7 +84,9 @@ class WebSocketLink:
         try:
             # a socket of our own, so that a proxy of the environment is not used
             local_socket = socket.create_connection((host, port), OPEN_TIMEOUT)
-        except (OSError, OverflowError, UnicodeError):
+        except (socket.gaierror, UnicodeError):
+            raise DeviceError(f"there is no host '{host}' for {name}") from None
+        except (OSError, OverflowError):
             raise DeviceError(
                 f"{name} does not run: no answer at {host}:{port}; start it, or name its address "
                 "with service=HOST:PORT"
