@@ -44,12 +44,13 @@ NOTABLE_BOUNCE = 0.2
 contact has 0.14, and is meant to rest."""
 
 MAX_RESTITUTION = 0.98
-"""Largest coefficient of restitution of a rigid contact or limit. A blow then loses 1 % of the
-energy ½‖v⁺ − v‖²_M that stops and returns it, which covers the remainder of the integration."""
+"""Largest coefficient of restitution of a rigid contact or limit. It returns 2e/(1 + e) = 0.990 of
+½‖v⁺ − v‖²_M; a larger one would not be paid for."""
 
 
-PAID = 2.0 * MAX_RESTITUTION / (1.0 + MAX_RESTITUTION)
-"""Share of the energy ½‖v⁺ − v‖²_M of a step that its blows may give back, without unit."""
+PAID = 0.992
+"""Share of the energy ½‖v⁺ − v‖²_M of a step that its blows may give back, without unit. The rest
+covers the remainder of the integration."""
 
 BLOW_SPEED = 0.05
 """Normal speed in m/s, of a hinge in rad/s, from which a contact that closes is a blow. A slower

@@ -255,9 +255,10 @@ is. ``solver`` is the address of MuJoCo's choice, ``own_solver`` that of the sce
 ``STALLED``, ``paid`` ``PAID``. ``bounces`` is 1 if a contact or limit may bounce, ``rebounds`` the
 address of each row's e|v_n| in m/s, 0 where it is no blow, and ``rebound_ratio`` ρ of the step, 0
 without a blow; two buffers have a number per degree of freedom. Of limits and equality constraints:
-largest count of rows (0 if there are none), and addresses of the model's parameters, of copies, of the rows' own positions, of the
-velocities taken from ŵ and of J v⁺. Of margins: addresses and counts of the geoms that move, of
-pairs, and of the bodies' velocities; ``leashes`` is 1 for spatial tendons of no least length."""
+largest count of rows (0 if there are none), and addresses of the model's parameters, of copies, of
+the rows' own positions, of the velocities taken from ŵ and of J v⁺. Of margins: addresses and
+counts of the geoms that move, of pairs, and of the bodies' velocities; ``leashes`` is 1 for spatial
+tendons of no least length."""
 
 
 def bind_contact(
