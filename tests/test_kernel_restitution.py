@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 from kernel_runs import Array, Run, T, at_rest, go_on, load, run_of, samples_of, unlimited
+from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import METHODS, prepare
@@ -329,13 +331,31 @@ def test_a_pressed_and_pushed_tool_rests_to_the_bit_as_without_a_bounce(method: 
     assert found[0] == found[1]
 
 
+HELD = """<body name="tool"><joint type="slide" axis="0 0 1" limited="true" range="-0.004 1"/>
+    <geom size="0.01" mass="{mass}"/><site name="grip"/></body>"""
+
+
+@pytest.mark.parametrize("method", ["implicit", "lossless"])
+@pytest.mark.parametrize(("mass", "least", "most"), [(0.05, 0.0, 3e-6), (0.01, 1e-5, 4e-4)])
+def test_a_tool_that_is_pressed_on_while_it_bounces_sinks_in_only_if_it_is_light(
+    mass: float, least: float, most: float, method: str
+) -> None:
+    places = np.zeros((400, 3))
+    places[:, 2] = -np.minimum(0.3 * T * np.arange(400), 0.02)  # 38 N
+    run = started(scene(HELD.format(mass=mass), 0.25), method=method)
+    heights = go_on(run, samples_of(places)).ticks["tool_position"][:, 2]
+    assert (np.diff(heights) > 1e-5).any()
+    assert least < -0.004 - heights.min() < most
+    assert strict(run)
+
+
 PLATE = """<body name="plate" mocap="true" pos="0 0 -0.01">
     <geom type="box" size="0.1 0.1 0.01"/></body>
   <body name="ball" pos="0 0 0.02"><joint name="ball" type="slide" axis="0 0 1"/>
     <geom size="0.02" mass="0.05"/></body>"""
 
 
-def on_plate(run: Run, heights: Array) -> Array:
+def on_plate(run: Run, heights: NDArray[Any]) -> Array:
     """Returns the ball's velocities on a mocap plate that goes through these heights in m."""
     plate = run.scene.model.body("plate").mocapid[0]
     start, speeds = run.scene.data.mocap_pos[plate].copy(), []
@@ -358,9 +378,9 @@ def test_a_mocap_plate_strikes_with_its_own_speed_and_pays_for_it() -> None:
 
 
 def test_a_ball_that_rests_on_a_receding_plate_does_not_bounce() -> None:
-    time = T * np.arange(1, 300)
+    time: NDArray[Any] = T * np.arange(1, 300)
     run = started(scene(PLATE, 0.05, GRAVITY))
-    speeds = on_plate(run, np.asarray(0.05 * np.cos(2 * np.pi * time) - 0.05, dtype=np.float64))
+    speeds = on_plate(run, 0.05 * np.cos(2 * np.pi * time) - 0.05)
     exact = -0.05 * 2 * np.pi * np.sin(2 * np.pi * time)
     assert np.abs(speeds - exact).max() < 0.01
     assert strict(run)

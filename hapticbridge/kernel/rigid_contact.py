@@ -81,6 +81,7 @@ from hapticbridge.kernel.pose import Vector, add, cross, norm, subtract, vector_
 from hapticbridge.kernel.restitution import (
     NOTABLE_BOUNCE,
     PAID,
+    PRESSING,
     has_bounce,
     kinetic_loss,
     rebound_speed,
@@ -235,6 +236,7 @@ RIGID_DTYPE = np.dtype(
         ("last_energy", "<f8"),
         ("lift", "<f8"),
         ("ahead", "<f8"),
+        ("flight", "<f8"),
         ("largest_margin", "<f8"),
         ("stalled", "<f8"),
         ("paid", "<f8"),
@@ -245,7 +247,8 @@ RIGID_DTYPE = np.dtype(
 force; ``push_ratio`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_energy`` Σ E_k in J at
 the last tick. ``is_aimed`` is 1 from the edit to the end of the step, ``corrections`` counts its
 repetitions for sliding, and ``lift`` is the largest velocity in m/s subtracted for it; ``ahead``
-the time in s for which margins reach ahead, and ``largest_margin`` their largest in m. ``leads`` is
+the time in s for which margins reach ahead, ``flight`` what they add in m where there are bounces,
+and ``largest_margin`` their largest in m. ``leads`` is
 1 if the tool's margins follow the handle's speed, too. ``geom_rest`` and ``pair_rest`` are the
 file's own margins in m, at which contacts rest, and ``has_margins`` is 1 if there are any.
 ``is_shifted`` is 1 if the step was repeated
@@ -298,6 +301,7 @@ def bind_contact(
     for name in ("velocity_change", "momentum_change"):
         owned[name] = np.zeros(max(model.nv, 1))
     contact["bounces"] = has_bounce(model)
+    contact["flight"] = contact["bounces"] * PRESSING * step**2
     meets = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     meets[model.pair_geom1] = meets[model.pair_geom2] = True
     is_moving = model.body_weldid[model.geom_bodyid] > 0
@@ -923,7 +927,7 @@ def follow_speed(s: State) -> None:
         turn = vector_of(velocities[6 * body : 6 * body + 3])
         velocity = vector_of(velocities[6 * body + 3 : 6 * body + 6])
         velocity = add(velocity, cross(turn, subtract(centre, origin)))
-        way = ahead * (norm(velocity) + radii[geom] * norm(turn))
+        way = ahead * (norm(velocity) + radii[geom] * norm(turn)) + contact.flight
         if contact.leads and ints(mj.geom_is_tool, mj.ngeom)[geom]:
             way += RESULTS_AHEAD * _handle_way(s, centre, radii[geom])
         margins[geom] = at_rest[geom] + (way if way < widest else widest)
@@ -962,13 +966,13 @@ def _follow_limits(s: State) -> None:
         speed = abs(speeds[dof])
         if kinds[joint] == _BALL:
             speed = norm(vector_of(speeds[dof : dof + 3]))
-        margins[joint] = own[joint] + MARGIN + ahead * speed
+        margins[joint] = own[joint] + MARGIN + (ahead * speed + contact.flight)
     margins = floats(contact.tendon_margin, mj.ntendon)
     own = floats(contact.own_tendon_margin, mj.ntendon)
     speeds = floats(contact.ten_velocity, mj.ntendon)
     lengths, leashes = floats(mj.ten_length, mj.ntendon), ints(contact.leashes, mj.ntendon)
     for tendon in range(mj.ntendon):
-        way = ahead * abs(speeds[tendon])
+        way = ahead * abs(speeds[tendon]) + contact.flight
         wide = MARGIN + way
         if leashes[tendon]:
             wide = min(wide, max(lengths[tendon] - way, 0.0))
