@@ -40,6 +40,22 @@ def test_check_tells_counts_stiffness_and_cost(tmp_path: Path, call: Called) -> 
     assert "(contacts of the scene, by its solref and solimp)" in out
 
 
+@pytest.mark.parametrize(
+    ("contact", "words"),
+    [("rigid", "as rigid impacts"), ("scene", "by MuJoCo's springs, as in the file")],
+)
+def test_check_names_what_bounces_and_how(
+    contact: str, words: str, tmp_path: Path, call: Called
+) -> None:
+    text = scene_path("virtual_wall").read_text(encoding="utf-8")
+    line = f"e at most 0.74 ({words})"
+    for solref, is_said in (("0.002 0.1", True), ("0.002 1", False)):
+        path = tmp_path / "wall.xml"
+        path.write_text(text.replace('solref="0.002 1"', f'solref="{solref}"'), encoding="utf-8")
+        _, out, _ = call("check", path, "--contact", contact)
+        assert (line in out.replace("\n", " ")) == is_said
+
+
 @pytest.mark.parametrize("is_fused", [False, True])
 def test_check_names_a_body_whose_inertia_mujoco_refuses(
     is_fused: bool, tmp_path: Path, call: Called

@@ -381,7 +381,7 @@ BOUNCER = """<mujoco><option timestep="1e-4" gravity="0 0 0"/><worldbody>
 <geom name="floor" type="plane" size="1 1 .1" solmix="0"/>
 <body name="tool" pos="0 0 0.011"><freejoint/>
 <geom name="ball" size="0.01" mass="0.1" {}/><site name="grip"/></body></worldbody></mujoco>"""
-BOUNCE = "of a spring → of an impact, e ="
+BOUNCE = "of a spring → of an impact, e at most"
 
 
 @pytest.mark.parametrize(

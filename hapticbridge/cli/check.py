@@ -165,6 +165,9 @@ _CONTACTS = {
 }
 """Source of a contact's stiffness, by the kind of contacts."""
 
+_BOUNCES = {"rigid": "as rigid impacts", "scene": "by MuJoCo's springs, as in the file"}
+"""Cause of a bounce, by the kind of contacts."""
+
 
 def print_inventory(inventory: Inventory, contact: str) -> None:
     """Prints what the scene models, with the stiffness of the contacts that a run takes."""
@@ -189,6 +192,9 @@ def print_inventory(inventory: Inventory, contact: str) -> None:
             f"{least} to {most} kN/m at the tool, which sank in by {length(inventory.deepest)} "
             f"({_CONTACTS[contact]})"
         )
+    if inventory.bounces:
+        each = (f"{one.names}, e at most {one.e:.2g}" for one in inventory.bounces)
+        lines["bounces"] = f"{'; '.join(each)} ({_BOUNCES[contact]})"
     is_met = inventory.rows is None or inventory.geoms[MEETS_TOOL] > 0
     if inventory.possible_pairs and not inventory.flexes and not is_met:
         lines["contact"] = (

@@ -31,6 +31,20 @@ class _Springs(NamedTuple):
     solimp: NDArray[np.float64]
 
 
+class Bounce(NamedTuple):
+    """Contacts or limits of one kind that bounce.
+
+    Attributes:
+        subject: Key of ``TREATMENTS``.
+        names: Name of the one that bounces most, and the number of the others.
+        e: Its coefficient of restitution, without unit; beside another geom it may be less.
+    """
+
+    subject: str
+    names: str
+    e: float
+
+
 def announce_rigid(model: mujoco.MjModel, options: Mapping[str, Any]) -> tuple[SceneChange, ...]:
     """Returns what rigid contacts and constraints change, each as ``name: old → new``.
 
@@ -39,7 +53,14 @@ def announce_rigid(model: mujoco.MjModel, options: Mapping[str, Any]) -> tuple[S
         options: Options that rigid contacts need, by name.
     """
     springs = tuple(_springs(model))
-    changes = (*_softened(springs), *_bounces(springs), *_options(model.opt, options))
+    bouncing = (
+        SceneChange(
+            f"bounce of {each.names}: of a spring → of an impact, e at most {each.e:.2g}",
+            each.subject,
+        )
+        for each in _bounces(springs)
+    )
+    changes = (*_softened(springs), *bouncing, *_options(model.opt, options))
     is_flex = (model.eq_type > int(mujoco.mjtEq.mjEQ_TENDON)) & (model.eq_active0 != 0)
     is_soft = any(map(np.any, (model.dof_frictionloss, model.tendon_frictionloss, is_flex)))
     if is_soft and not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT:
@@ -97,17 +118,19 @@ def _softened(springs: Sequence[_Springs]) -> Iterator[SceneChange]:
             yield SceneChange(words, each.subject)
 
 
-def _bounces(springs: Sequence[_Springs]) -> Iterator[SceneChange]:
-    """Yields contacts and limits that bounce, with the largest e (``kernel.restitution``)."""
+def bounces(model: mujoco.MjModel) -> tuple[Bounce, ...]:
+    """Returns the contacts and limits that bounce, by kind (``kernel.restitution``)."""
+    return tuple(_bounces(tuple(_springs(model))))
+
+
+def _bounces(springs: Sequence[_Springs]) -> Iterator[Bounce]:
     law = source_of(rigid_restitution)
     for each in springs:
-        bounces = np.array([law(*one) for one in each.solref.tolist()])
-        if each.subject != "equality's softness" and bounces.any():
-            order = np.argsort(-bounces, kind="stable")
+        e = np.array([law(*one) for one in each.solref.tolist()])
+        if each.subject != "equality's softness" and e.any():
+            order = np.argsort(-e, kind="stable")
             bouncing = each._replace(names=[each.names[i] for i in order])
-            named = _first(bouncing, bounces[order] > 0.0)
-            words = f"bounce of {named}: of a spring → of an impact, e = {bounces.max():.2g}"
-            yield SceneChange(words, each.subject)
+            yield Bounce(each.subject, _first(bouncing, e[order] > 0.0), float(e.max()))
 
 
 def _first(springs: _Springs, mask: NDArray[np.bool_]) -> str:
