@@ -27,7 +27,7 @@ def test_check_tells_counts_stiffness_and_cost(tmp_path: Path, call: Called) -> 
         "pairs that can touch 1, 1 did",
         "contact rows         at most 1 in a step",
         "contact stiffness    21,200 to 21,200 kN/m at the tool",
-        "(rigid contacts; solref and solimp of the scene have no effect)",
+        "(rigid contacts; solref and solimp of the scene give no softness)",
         "only visual: geom 'bench', geom 'rail'",
         "whole tick, median",
         "highest rate:",

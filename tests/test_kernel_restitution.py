@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+from audit_cases import recorded
 from kernel_runs import Array, Run, T, at_rest, go_on, load, run_of, samples_of, unlimited
 from numpy.typing import NDArray
 
+from hapticbridge.audit import audit
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import METHODS, prepare
 from hapticbridge.kernel.jit import source_of
@@ -20,6 +23,7 @@ from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.restitution import MAX_RESTITUTION, restitution, rigid_restitution
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
+from hapticbridge.run.bridge import Bridge
 from hapticbridge.theory.impact import ImpactBody, resolve_impact
 
 COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
@@ -311,6 +315,50 @@ def test_a_paddle_under_a_bouncing_ball_is_strict_and_simulated_again_to_the_bit
         assert done == 2000
         assert again.ticks.tobytes() == live.ticks.tobytes()
     assert blows >= 6
+
+
+@pytest.mark.parametrize("method", ["implicit", "lossless"])
+def test_a_recorded_run_with_blows_is_audited_to_the_bit(tmp_path: Path, method: str) -> None:
+    path, blows = tmp_path / "paddle.xml", []
+    path.write_text(scene(PADDLE, 0.05, GRAVITY, friction=0.4), encoding="utf-8")
+
+    def note(bridge: Bridge, _: int) -> None:
+        blows.append(float(bridge.data.joint("ball").qvel[0]))
+
+    recorded(tmp_path / "run.mcap", path, duration=1.0, on_tick=note, method=method)
+    assert np.diff(blows).max() > 0.5
+    report = audit(tmp_path / "run.mcap")
+    assert report.resimulation == "bit for bit"
+    assert report.environment == "strict"
+
+
+STRUCK = """<body name="tool"><freejoint/>
+    <geom type="box" size="0.03 0.03 0.005" mass="0.1"/><site name="grip"/></body>
+  <body name="ball" pos="0 0 {height}"><joint name="ball" type="slide" axis="0 0 1"/>
+    <geom size="0.02" mass="0.05"/></body>"""
+
+
+@pytest.mark.parametrize(
+    ("method", "speed", "is_kept"),
+    [
+        ("implicit", 1.0, True),
+        ("implicit", 8.0, True),
+        ("lossless", 1.0, True),
+        ("lossless", 3.0, True),
+        ("lossless", 8.0, False),
+    ],
+)
+def test_a_tool_is_struck_with_the_rebound_it_can_pay_for(
+    method: str, speed: float, is_kept: bool
+) -> None:
+    e = e_of(0.1)
+    for phase in np.linspace(0.0, 1.0, 4, endpoint=False):
+        xml = scene(STRUCK.format(height=0.075 + phase * speed * T), 0.1)
+        run = started(xml, {"ball": -speed}, method)
+        parting = resting(run, 0.06 / speed + 5 * T, lambda d: d.qvel[6] - d.qvel[2]).max()
+        assert (parting == pytest.approx(e * speed, rel=2e-3)) == is_kept
+        assert 0.5 * e * speed < parting < 1.002 * e * speed
+        assert strict(run)
 
 
 PRESSED = """<body name="tool" pos="0 0 0.01"><freejoint/>

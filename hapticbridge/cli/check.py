@@ -160,7 +160,7 @@ def print_case(case: SceneUnderCheck) -> None:
 
 
 _CONTACTS = {
-    "rigid": "rigid contacts; solref and solimp of the scene have no effect",
+    "rigid": "rigid contacts; solref and solimp of the scene give no softness",
     "scene": "contacts of the scene, by its solref and solimp",
 }
 """Source of a contact's stiffness, by the kind of contacts."""

@@ -21,8 +21,8 @@ as weight does, adds to C: high rebounds below 0.1 m/s are lowered, those of a r
 
 One ρ holds for all blows of a step. A chain of bodies that touch passes a blow on as if they were
 one body. The rebound begins within h|v_n| of the surface, so that a ball's rebound height errs by
-that much: 1 mm at 1 m/s and 1 ms. A lossless tool that was not seen near pays nothing, because its
-½‖v⁺ − v‖²_M is no loss.
+that much: 1 mm at 1 m/s and 1 ms. A lossless tool that is struck before it is seen near, from about
+4 m/s on at 1 ms, pays nothing, because its ½‖v⁺ − v‖²_M is no loss: its rebound is smaller.
 
 References:
     Stronge 1990, Proc. R. Soc. A 431 (Newton's rule and energy).
