@@ -323,7 +323,7 @@ def test_a_recorded_run_with_blows_is_audited_to_the_bit(tmp_path: Path, method:
     path.write_text(scene(PADDLE, 0.05, GRAVITY, friction=0.4), encoding="utf-8")
 
     def note(bridge: Bridge, _: int) -> None:
-        blows.append(float(bridge.data.joint("ball").qvel[0]))
+        blows.append(float(bridge.scene.data.joint("ball").qvel[0]))
 
     recorded(tmp_path / "run.mcap", path, duration=1.0, on_tick=note, method=method)
     assert np.diff(blows).max() > 0.5
