@@ -27,7 +27,7 @@ def test_check_tells_counts_stiffness_and_cost(tmp_path: Path, call: Called) -> 
         "pairs that can touch 1, 1 did",
         "contact rows         at most 1 in a step",
         "contact stiffness    21,200 to 21,200 kN/m at the tool",
-        "(rigid contacts; solref and solimp of the scene have no effect)",
+        "(rigid contacts; solref and solimp of the scene give no softness)",
         "only visual: geom 'bench', geom 'rail'",
         "whole tick, median",
         "highest rate:",
@@ -38,6 +38,22 @@ def test_check_tells_counts_stiffness_and_cost(tmp_path: Path, call: Called) -> 
     _, out, _ = call("check", "virtual_wall", "--contact", "scene")
     assert "kN/m at the tool" in out and "21,200" not in out
     assert "(contacts of the scene, by its solref and solimp)" in out
+
+
+@pytest.mark.parametrize(
+    ("contact", "words"),
+    [("rigid", "as rigid impacts"), ("scene", "by MuJoCo's springs, as in the file")],
+)
+def test_check_names_what_bounces_and_how(
+    contact: str, words: str, tmp_path: Path, call: Called
+) -> None:
+    text = scene_path("virtual_wall").read_text(encoding="utf-8")
+    line = f"e at most 0.74 ({words})"
+    for solref, is_said in (("0.002 0.1", True), ("0.002 1", False)):
+        path = tmp_path / "wall.xml"
+        path.write_text(text.replace('solref="0.002 1"', f'solref="{solref}"'), encoding="utf-8")
+        _, out, _ = call("check", path, "--contact", contact)
+        assert (line in out.replace("\n", " ")) == is_said
 
 
 @pytest.mark.parametrize("is_fused", [False, True])

@@ -16,6 +16,8 @@ from outside_scenes import scene_file
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import prepare
 from hapticbridge.errors import SceneError
+from hapticbridge.kernel.jit import source_of
+from hapticbridge.kernel.restitution import restitution
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import contacts, load_scene, scene_names
 from hapticbridge.scene.contacts import (
@@ -24,7 +26,6 @@ from hapticbridge.scene.contacts import (
     contact_concerns,
     contact_numbers,
 )
-from hapticbridge.scene.softness import restitution
 
 H = 1e-3
 SOLIMP = (0.9, 0.95, 0.001)
@@ -380,6 +381,7 @@ BOUNCER = """<mujoco><option timestep="1e-4" gravity="0 0 0"/><worldbody>
 <geom name="floor" type="plane" size="1 1 .1" solmix="0"/>
 <body name="tool" pos="0 0 0.011"><freejoint/>
 <geom name="ball" size="0.01" mass="0.1" {}/><site name="grip"/></body></worldbody></mujoco>"""
+BOUNCE = "of a spring → of an impact, e at most"
 
 
 @pytest.mark.parametrize(
@@ -399,19 +401,21 @@ def test_restitution_is_what_mujoco_gives_a_ball(
     data = mujoco.MjData(model)
     data.qvel[2] = -0.2
     mujoco.mj_step(model, data, 4000)
-    assert restitution(solref) == pytest.approx(expected, abs=0.01)
-    assert data.qvel[2] / 0.2 == pytest.approx(restitution(solref), abs=0.02)
+    e = source_of(restitution)(*solref)
+    assert e == pytest.approx(expected, abs=0.01)
+    assert data.qvel[2] / 0.2 == pytest.approx(e, abs=0.02)
 
 
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        ('solref="-4000 -10"', "bounce of geom 'ball': e = 0.79 → 0"),
+        ('solref="-4000 -10"', f"bounce of geom 'ball': {BOUNCE} 0.79"),
+        ('solref="0.02 0"', f"bounce of geom 'ball': {BOUNCE} 0.98"),
         ('margin="0.005" solref="0.005 1"', ""),
         ('solref="-4000 -10" contype="0" conaffinity="0"', ""),
     ],
 )
-def test_a_bounce_that_rigid_contacts_lack_is_said(tmp_path: Path, setting: str, said: str) -> None:
+def test_a_bounce_is_said_with_its_coefficient(tmp_path: Path, setting: str, said: str) -> None:
     scene = load_scene(scene_file(tmp_path, BOUNCER.format(setting)))
     before = scene.changes
     scene.set_contact(is_rigid=True)

@@ -433,7 +433,6 @@ def ball_on_floor(ball: str = "", more: str = "", option: str = "", flag: str = 
 
 
 REPLACED = {
-    "bounce": (on_floor("", 'solref="-5000 -1"', ".1"), "bounce of geom 'bg': e = 0.98 → 0"),
     "softness": (
         ball_on_floor('solref=".3 1"'),
         "geom 'bg': a spring of 1.6 Hz → rigid",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hapticbridge.check.observe import Observation, reached_trees
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE
 from hapticbridge.scene.contacts import meeting_pairs
+from hapticbridge.scene.softness import Bounce, bounces
 from hapticbridge.scene.source_map import Place, Places
 
 VISUAL = "only visual"
@@ -55,6 +56,7 @@ class Inventory:
         stiffness: Smallest and largest contact stiffness of the tool in N/m under a perceptible
             force; None without such a contact.
         deepest: Largest penetration of the tool in m; 0 without a contact.
+        bounces: Contacts and limits that bounce.
         actuators: Actuators of the scene itself.
         equalities: Equality constraints.
         tendons: Tendons.
@@ -74,6 +76,7 @@ class Inventory:
     rows: dict[str, tuple[int, float]] | None
     stiffness: tuple[float, float] | None
     deepest: float
+    bounces: tuple[Bounce, ...]
     actuators: int
     equalities: int
     tendons: int
@@ -125,6 +128,7 @@ def take_inventory(
         if carried
         else None,
         deepest=max((meeting.deepest for meeting in touching), default=0.0),
+        bounces=bounces(model),
         actuators=sum(name not in COUPLING_ACTUATORS for name in names),
         equalities=int(model.neq),
         tendons=int(model.ntendon),

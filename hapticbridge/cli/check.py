@@ -160,10 +160,13 @@ def print_case(case: SceneUnderCheck) -> None:
 
 
 _CONTACTS = {
-    "rigid": "rigid contacts; solref and solimp of the scene have no effect",
+    "rigid": "rigid contacts; solref and solimp of the scene give no softness",
     "scene": "contacts of the scene, by its solref and solimp",
 }
 """Source of a contact's stiffness, by the kind of contacts."""
+
+_BOUNCES = {"rigid": "as rigid impacts", "scene": "by MuJoCo's springs, as in the file"}
+"""Cause of a bounce, by the kind of contacts."""
 
 
 def print_inventory(inventory: Inventory, contact: str) -> None:
@@ -189,6 +192,9 @@ def print_inventory(inventory: Inventory, contact: str) -> None:
             f"{least} to {most} kN/m at the tool, which sank in by {length(inventory.deepest)} "
             f"({_CONTACTS[contact]})"
         )
+    if inventory.bounces:
+        each = (f"{one.names}, e at most {one.e:.2g}" for one in inventory.bounces)
+        lines["bounces"] = f"{'; '.join(each)} ({_BOUNCES[contact]})"
     is_met = inventory.rows is None or inventory.geoms[MEETS_TOOL] > 0
     if inventory.possible_pairs and not inventory.flexes and not is_met:
         lines["contact"] = (

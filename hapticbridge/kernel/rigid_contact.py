@@ -42,6 +42,9 @@ along its normal, and friction takes energy; where the tank says otherwise the s
 with the law of other contacts. The exact inverse inertia of such a row is 0, so a step
 with one uses the approximate ones for all.
 
+A contact that closes in a *blow* is aimed at its rebound (``kernel.restitution``). Such a step may
+give what the blow itself dissipates, too; beyond it, the rebound is lowered.
+
 Limits of joints and tendons are rows like those of a contact without friction; they hold a joint
 at the scene's own margin from the end of its range, as MuJoCo's do. An equality
 constraint has ŵ = −σ β p/h − (1 − σ) δp/h for an error p of either sign; δp is the part of p that a
@@ -75,6 +78,14 @@ from hapticbridge.kernel.ledger import mocap_work, opened_by_mocap
 from hapticbridge.kernel.mujoco_c import floats, ints, mj_mul_jac, pointer_at, struct_of
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.pose import Vector, add, cross, norm, subtract, vector_of
+from hapticbridge.kernel.restitution import (
+    NOTABLE_BOUNCE,
+    PAID,
+    PRESSING,
+    has_bounce,
+    kinetic_loss,
+    rebound_speed,
+)
 
 SOFTNESS = 1e-3
 """Regularisation R over the inverse inertia of a contact, without unit. A steady force F on a mass
@@ -138,6 +149,13 @@ FORCE_ERROR = 0.02
 OPEN = -1e3
 """Wanted velocity in m/s of a blocked contact without force. No sliding closes it."""
 
+MAX_CUT = 0.9
+"""Largest share of a rebound that stays when a step gives too much energy, without unit. A larger
+one keeps more of the rebound and repeats more steps."""
+
+REBOUND_ERROR = 0.01
+"""Largest error of a rebound's normal velocity, without unit, before the step is repeated."""
+
 _EXACT = 1e-9
 """ε of the module's equations, without unit: the spring that is left in the row of a contact, and
 the velocity that is left in the rows of friction."""
@@ -187,6 +205,7 @@ _OWNED = (
     *(f"own_{name}" for name in _PARAMETERS),
     *("eq_type", "row_positions", "row_shifts", "end_velocity", "moving_geoms", "body_velocity"),
     *("leashes", "blocked", "geom_rest", "pair_rest"),
+    *("rebounds", "velocity_change", "momentum_change"),
 )
 
 RIGID_DTYPE = np.dtype(
@@ -203,6 +222,7 @@ RIGID_DTYPE = np.dtype(
         ("has_margins", "<i8"),
         ("solver", "<i8"),
         ("own_solver", "<i8"),
+        ("bounces", "<i8"),
         ("statistics", "<i8"),
         ("warmstart", "<i8"),
         ("row_capacity", "<i8"),
@@ -210,13 +230,16 @@ RIGID_DTYPE = np.dtype(
         ("moving_count", "<i8"),
         ("pair_count", "<i8"),
         ("push_ratio", "<f8"),
+        ("rebound_ratio", "<f8"),
         ("tank", "<f8"),
         ("cap", "<f8"),
         ("last_energy", "<f8"),
         ("lift", "<f8"),
         ("ahead", "<f8"),
+        ("flight", "<f8"),
         ("largest_margin", "<f8"),
         ("stalled", "<f8"),
+        ("paid", "<f8"),
     ]
 )
 """Sub-record ``contact``, written by this module alone. ``is_rigid`` is 1 if contacts are rigid;
@@ -224,17 +247,21 @@ RIGID_DTYPE = np.dtype(
 force; ``push_ratio`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_energy`` Σ E_k in J at
 the last tick. ``is_aimed`` is 1 from the edit to the end of the step, ``corrections`` counts its
 repetitions for sliding, and ``lift`` is the largest velocity in m/s subtracted for it; ``ahead``
-the time in s for which margins reach ahead, and ``largest_margin`` their largest in m. ``leads`` is
+the time in s for which margins reach ahead, ``flight`` what they add in m where there are bounces,
+and ``largest_margin`` their largest in m. ``leads`` is
 1 if the tool's margins follow the handle's speed, too. ``geom_rest`` and ``pair_rest`` are the
 file's own margins in m, at which contacts rest, and ``has_margins`` is 1 if there are any.
 ``is_shifted`` is 1 if the step was repeated
 without −h J̇v. ``pressing`` counts the blocked contacts in penetration, and ``blocked`` is the
 address of h R N of each row in m/s, −1 where it is none; ``is_sparse`` is 1 if MuJoCo's Jacobian
 is. ``solver`` is the address of MuJoCo's choice, ``own_solver`` that of the scene; ``stalled`` is
-``STALLED``. Of limits and equality constraints: largest count of rows (0 if there
-are none), and addresses of the model's parameters, of copies, of the rows' own positions, of the
-velocities taken from ŵ and of J v⁺. Of margins: addresses and counts of the geoms that move, of
-pairs, and of the bodies' velocities; ``leashes`` is 1 for spatial tendons of no least length."""
+``STALLED``, ``paid`` ``PAID``. ``bounces`` is 1 if a contact or limit may bounce, ``rebounds`` the
+address of each row's e|v_n| in m/s, 0 where it is no blow, and ``rebound_ratio`` ρ of the step, 0
+without a blow; two buffers have a number per degree of freedom. Of limits and equality constraints:
+largest count of rows (0 if there are none), and addresses of the model's parameters, of copies, of
+the rows' own positions, of the velocities taken from ŵ and of J v⁺. Of margins: addresses and
+counts of the geoms that move, of pairs, and of the bodies' velocities; ``leashes`` is 1 for spatial
+tendons of no least length."""
 
 
 def bind_contact(
@@ -250,7 +277,7 @@ def bind_contact(
     contact["solver"], contact["own_solver"] = model._address + _SOLVER, model.opt.solver
     contact["statistics"] = data._address + struct_of("mjData").solver.offset
     contact["warmstart"] = data.qacc_warmstart.ctypes.data
-    contact["stalled"] = STALLED
+    contact["stalled"], contact["paid"] = STALLED, PAID
     contact["is_sparse"] = mujoco.mj_isSparse(model)
     is_rigid = model.eq_type <= LAST_RIGID
     if np.any(is_rigid) or np.any(model.jnt_limited) or np.any(model.tendon_limited):
@@ -269,7 +296,12 @@ def bind_contact(
         owned[name] = np.zeros(max(int(contact["row_capacity"]), 1))
     is_spatial = model.wrap_type[model.tendon_adr] != mujoco.mjtWrap.mjWRAP_JOINT
     owned["leashes"] = (is_spatial & (model.tendon_range[:, 0] <= 0.0)).astype(np.int32)
-    owned["end_velocity"], owned["blocked"] = np.zeros(MAX_ROWS), np.zeros(MAX_ROWS)
+    for name in ("end_velocity", "blocked", "rebounds"):
+        owned[name] = np.zeros(MAX_ROWS)
+    for name in ("velocity_change", "momentum_change"):
+        owned[name] = np.zeros(max(model.nv, 1))
+    contact["bounces"] = has_bounce(model)
+    contact["flight"] = contact["bounces"] * PRESSING * step**2
     meets = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     meets[model.pair_geom1] = meets[model.pair_geom2] = True
     is_moving = model.body_weldid[model.geom_bodyid] > 0
@@ -360,13 +392,15 @@ def _aim(s: State) -> None:
                 rest += (friction[j - 1] * ends[row + j]) ** 2
         distance = opening(s, contact)
         wanted = (-push if distance < 0.0 else -1.0) * distance / h
-        if s.energy.mocap_has_moved:
-            opened = max(opened_by_mocap(s, contact), 0.0)
-            wanted -= max(opened - max(distance, 0.0), 0.0) / h
+        opened = opened_by_mocap(s, contact) if s.energy.mocap_has_moved else 0.0
+        wanted -= max(max(opened, 0.0) - max(distance, 0.0), 0.0) / h
+        rebound = _rebound(s, row)
+        if rebound > 0.0:
+            wanted = max(wanted, _softened(rebound - opened / h, velocities[row]))
         stop = max(wanted - velocities[row], 0.0)
         lift = max(math.sqrt(slide) - friction[0] ** 2 * stop, 0.0)
         if s.contact.corrections > 0:
-            lift = min(lift, math.sqrt(rest))
+            lift = math.sqrt(rest) if rebound > 0.0 else min(lift, math.sqrt(rest))
         solimp, d = floats(contact + mj.contact_solimp, 2), _IMPEDANCE
         if row < MAX_ROWS and blocked[row] >= 0.0:
             slip = math.sqrt(rest if s.contact.corrections > 0 else slide)
@@ -530,6 +564,9 @@ def _aim_rows(s: State) -> None:
         if kind == EQUALITY and has_moved:
             wanted -= (1.0 - contact.push_ratio) * (own[row] - before[row]) / h
         wanted -= shifts[row]
+        rebound = _rebound(s, row) if kind != EQUALITY else 0.0
+        if rebound > 0.0:
+            wanted = max(wanted, _softened(rebound, velocities[row]))
         positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
         margins[row] = 0.0
         place, impedances, _, _ = _parameters_of(s, kind)
@@ -598,6 +635,62 @@ def _unblock(s: State) -> bool:
 
 
 @compiled
+def _note_blows(s: State) -> None:
+    """Notes the contacts and limits that close in a blow, and their e|v_n| in m/s."""
+    mj, contact, h = s.mj, s.contact, s.run.timestep
+    count, contacts = min(ints(mj.nefc, 1)[0], MAX_ROWS), pointer_at(mj.contact)
+    rebounds = floats(contact.rebounds, count)
+    velocities, blocked = floats(pointer_at(mj.efc_vel), count), floats(contact.blocked, count)
+    kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
+    positions = floats(pointer_at(mj.efc_pos), count)
+    for row in range(count):
+        kind, i, rebounds[row] = kinds[row], ids[row], 0.0
+        if kind in (LIMIT_JOINT, LIMIT_TENDON) and row < contact.row_capacity:
+            gap = positions[row] - _limit_margin(s, kind, i) + h * velocities[row]
+            solref = _parameters_of(s, kind)[2] + 16 * i
+            rebounds[row] = rebound_speed(velocities[row], gap, solref)
+    for c in range(ints(mj.ncon, 1)[0]):
+        one = contacts + c * mj.contact_size
+        row = ints(one + mj.contact_row, 1)[0]
+        if 0 <= row < count and blocked[row] < 0.0:
+            gap = opening(s, one) + h * velocities[row]
+            moved = opened_by_mocap(s, one) / h if s.energy.mocap_has_moved else 0.0
+            rebounds[row] = rebound_speed(velocities[row] + moved, gap, one + mj.contact_solref)
+    for row in range(count):
+        if rebounds[row] > 0.0:
+            contact.rebound_ratio = 1.0
+
+
+@compiled
+def _rebound(s: State, row: int) -> float:
+    """Returns ρ e|v_n| of a row in m/s, 0 where it is no blow."""
+    if s.contact.rebound_ratio == 0.0 or row >= MAX_ROWS:
+        return 0.0
+    return float(s.contact.rebound_ratio * floats(s.contact.rebounds, row + 1)[row])
+
+
+@compiled
+def _softened(end: float, start: float) -> float:
+    """Returns the ŵ in m/s with which a row ends at a velocity in spite of its regularisation."""
+    return end + 0.5 * SOFTNESS * (end - start)
+
+
+@compiled
+def _lower_rebound(contact: Part, allowed: float, returned: float) -> None:
+    """Lowers ρ of a step that returned more energy than is allowed, in J.
+
+    The energy that one blow with e returns over ½‖v⁺ − v‖²_M is 2e/(1 + e). Below
+    ``NOTABLE_BOUNCE`` the rebound ends.
+    """
+    ratio = contact.rebound_ratio
+    part = max(allowed, 0.0) / returned * 2.0 * ratio / (1.0 + ratio)
+    ratio = min(part / (2.0 - part), MAX_CUT * ratio)
+    contact.rebound_ratio = ratio if ratio >= NOTABLE_BOUNCE else 0.0
+    if contact.rebound_ratio == 0.0:
+        contact.corrections = 0
+
+
+@compiled
 def aim_contacts(s: State) -> None:
     """Makes contacts, limits and equality constraints of the coming ``mj_step2`` rigid.
 
@@ -608,10 +701,13 @@ def aim_contacts(s: State) -> None:
         has_energy = _spendable(s) > 0.0 or s.energy.mocap_has_moved
         contact.push_ratio = 1.0 if has_energy else 0.0
         contact.corrections = contact.is_shifted = contact.is_aimed = 0
+        contact.rebound_ratio = 0.0
         ints(contact.solver, 1)[0] = contact.own_solver
         _note_blocked(s)
         if contact.pressing:
             ints(s.mj.enableflags, 1)[0] &= ~_EXACT_DIAGONAL
+        if contact.bounces:
+            _note_blows(s)
         _aim(s)
         contact.is_aimed = 1
 
@@ -684,17 +780,30 @@ def _note_ends(s: State) -> None:
 
 @compiled
 def _has_sunk(s: State) -> bool:
-    """Returns True if a contact sank in the step because it slid less than at the start."""
+    """Returns True if a contact sank in the step because it slid less than at the start.
+
+    A blow must end with its rebound, whose lift is not known before either.
+    """
     mj, h, contact = s.mj, s.run.timestep, s.contact
     count = ints(mj.nefc, 1)[0]
-    if h * contact.lift <= SUNK or count > MAX_ROWS:
+    is_smooth = h * contact.lift <= SUNK and contact.rebound_ratio == 0.0
+    if is_smooth or count > MAX_ROWS:
         return False
     _note_ends(s)
     ends, contacts = floats(contact.end_velocity, count), pointer_at(mj.contact)
+    force = floats(pointer_at(mj.efc_force), count)
     for c in range(ints(mj.ncon, 1)[0]):
         one = contacts + c * mj.contact_size
         row = ints(one + mj.contact_row, 1)[0]
         if row < 0 or ints(one + mj.contact_dim, 1)[0] == 1:
+            continue
+        rebound = _rebound(s, row)
+        if rebound > 0.0:
+            if s.energy.mocap_has_moved:
+                rebound -= opened_by_mocap(s, one) / h
+            error = abs(ends[row] - rebound) if force[row] > 0.0 else rebound - ends[row]
+            if error > REBOUND_ERROR * abs(rebound):
+                return True
             continue
         gap = max(opening(s, one), 0.0)
         if gap + h * ends[row] < -SUNK:
@@ -751,10 +860,17 @@ def aim_again(s: State) -> bool:
     allowed, returned = max(_spendable(s), 0.0), returned_energy(s)
     if s.energy.mocap_has_moved:
         allowed += mocap_work(s)  # the external port pays for it
-    if returned <= allowed or not (_unblock(s) or _shift_rows(s) or contact.push_ratio > 0.0):
+    is_blow = contact.rebound_ratio > 0.0
+    if is_blow:
+        allowed += contact.paid * kinetic_loss(s)
+    if returned <= allowed or not (
+        _unblock(s) or _shift_rows(s) or contact.push_ratio > 0.0 or is_blow
+    ):
         return False
+    if is_blow and contact.push_ratio == 0.0:
+        _lower_rebound(contact, allowed, returned)
     # C is nearly proportional to the share while the forces stay; a second excess ends it
-    is_first = contact.push_ratio == 1.0 and allowed > 0.0
+    is_first = contact.push_ratio == 1.0 and allowed > 0.0 and not is_blow
     contact.push_ratio = SPENDABLE * allowed / returned if is_first else 0.0
     contact.repetitions += 1
     _aim(s)
@@ -811,7 +927,7 @@ def follow_speed(s: State) -> None:
         turn = vector_of(velocities[6 * body : 6 * body + 3])
         velocity = vector_of(velocities[6 * body + 3 : 6 * body + 6])
         velocity = add(velocity, cross(turn, subtract(centre, origin)))
-        way = ahead * (norm(velocity) + radii[geom] * norm(turn))
+        way = ahead * (norm(velocity) + radii[geom] * norm(turn)) + contact.flight
         if contact.leads and ints(mj.geom_is_tool, mj.ngeom)[geom]:
             way += RESULTS_AHEAD * _handle_way(s, centre, radii[geom])
         margins[geom] = at_rest[geom] + (way if way < widest else widest)
@@ -850,13 +966,13 @@ def _follow_limits(s: State) -> None:
         speed = abs(speeds[dof])
         if kinds[joint] == _BALL:
             speed = norm(vector_of(speeds[dof : dof + 3]))
-        margins[joint] = own[joint] + MARGIN + ahead * speed
+        margins[joint] = own[joint] + MARGIN + (ahead * speed + contact.flight)
     margins = floats(contact.tendon_margin, mj.ntendon)
     own = floats(contact.own_tendon_margin, mj.ntendon)
     speeds = floats(contact.ten_velocity, mj.ntendon)
     lengths, leashes = floats(mj.ten_length, mj.ntendon), ints(contact.leashes, mj.ntendon)
     for tendon in range(mj.ntendon):
-        way = ahead * abs(speeds[tendon])
+        way = ahead * abs(speeds[tendon]) + contact.flight
         wide = MARGIN + way
         if leashes[tendon]:
             wide = min(wide, max(lengths[tendon] - way, 0.0))

@@ -10,6 +10,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.kernel.jit import source_of
+from hapticbridge.kernel.restitution import rigid_restitution
 from hapticbridge.scene.contacts import contact_numbers
 from hapticbridge.scene.treatment import SceneChange
 from hapticbridge.units import format_si
@@ -17,10 +19,6 @@ from hapticbridge.units import format_si
 SOFT_FREQUENCY = 15.0
 """Natural frequency in Hz below which a constraint is meant as a spring. MuJoCo's default holds at
 24 Hz. A hand moves at up to 10 Hz, and would feel a softer one yield."""
-
-NOTABLE_BOUNCE = 0.2
-"""Coefficient of restitution below which a rigid contact is not said to differ from the file's.
-Bodies in default contact bounce with 0.14."""
 
 
 class _Springs(NamedTuple):
@@ -33,6 +31,20 @@ class _Springs(NamedTuple):
     solimp: NDArray[np.float64]
 
 
+class Bounce(NamedTuple):
+    """Contacts or limits of one kind that bounce.
+
+    Attributes:
+        subject: Key of ``TREATMENTS``.
+        names: Name of the one that bounces most, and the number of the others.
+        e: Its coefficient of restitution, without unit; beside another geom it may be less.
+    """
+
+    subject: str
+    names: str
+    e: float
+
+
 def announce_rigid(model: mujoco.MjModel, options: Mapping[str, Any]) -> tuple[SceneChange, ...]:
     """Returns what rigid contacts and constraints change, each as ``name: old → new``.
 
@@ -41,7 +53,14 @@ def announce_rigid(model: mujoco.MjModel, options: Mapping[str, Any]) -> tuple[S
         options: Options that rigid contacts need, by name.
     """
     springs = tuple(_springs(model))
-    changes = (*_softened(springs), *_bounces(springs), *_options(model.opt, options))
+    bouncing = (
+        SceneChange(
+            f"bounce of {each.names}: of a spring → of an impact, e at most {each.e:.2g}",
+            each.subject,
+        )
+        for each in _bounces(springs)
+    )
+    changes = (*_softened(springs), *bouncing, *_options(model.opt, options))
     is_flex = (model.eq_type > int(mujoco.mjtEq.mjEQ_TENDON)) & (model.eq_active0 != 0)
     is_soft = any(map(np.any, (model.dof_frictionloss, model.tendon_frictionloss, is_flex)))
     if is_soft and not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT:
@@ -99,16 +118,19 @@ def _softened(springs: Sequence[_Springs]) -> Iterator[SceneChange]:
             yield SceneChange(words, each.subject)
 
 
-def _bounces(springs: Sequence[_Springs]) -> Iterator[SceneChange]:
+def bounces(model: mujoco.MjModel) -> tuple[Bounce, ...]:
+    """Returns the contacts and limits that bounce, by kind (``kernel.restitution``)."""
+    return tuple(_bounces(tuple(_springs(model))))
+
+
+def _bounces(springs: Sequence[_Springs]) -> Iterator[Bounce]:
+    law = source_of(rigid_restitution)
     for each in springs:
-        bounces = np.array([restitution(one) for one in each.solref])
-        notable = bounces >= NOTABLE_BOUNCE
-        if each.subject in ("softness", "override softness") and notable.any():
-            order = np.argsort(-bounces, kind="stable")
+        e = np.array([law(*one) for one in each.solref.tolist()])
+        if each.subject != "equality's softness" and e.any():
+            order = np.argsort(-e, kind="stable")
             bouncing = each._replace(names=[each.names[i] for i in order])
-            named = _first(bouncing, notable[order])
-            words = f"bounce of {named}: e = {bounces.max():.2g} → 0"
-            yield SceneChange(words, each.subject)
+            yield Bounce(each.subject, _first(bouncing, e[order] > 0.0), float(e.max()))
 
 
 def _first(springs: _Springs, mask: NDArray[np.bool_]) -> str:
@@ -139,24 +161,3 @@ def _options(option: mujoco.MjOption, needed: Mapping[str, Any]) -> Iterator[Sce
     if option.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE and option.o_margin > 0.0:
         words = f"o_margin: {format_si(option.o_margin, 'm')} → 0"
         yield SceneChange(words, "override margin")
-
-
-def restitution(solref: Sequence[float]) -> float:
-    """Returns MuJoCo's coefficient of restitution of a contact, from 0 to 1.
-
-    A spring and damper that only push let go where their force is zero, before the spring is at
-    rest: e = exp(−ζ φ/s) with s = √(1 − ζ²), φ = atan2(2ζs, 2ζ² − 1); for ζ > 1 with s = √(ζ² − 1),
-    φ = artanh(2ζs/(2ζ² − 1)). Critical damping, MuJoCo's default, has e = exp(−2) = 0.14.
-
-    Args:
-        solref: MuJoCo's (time constant in s, damping ratio ζ), or (−k, −b) with ζ = b/(2√k).
-    """
-    first, second = float(solref[0]), float(solref[1])
-    ratio = second if first > 0.0 else -second / (2.0 * math.sqrt(-first)) if first else 1.0
-    ratio = max(ratio, 0.0)
-    root = math.sqrt(abs(1.0 - ratio**2))
-    if root < 1e-6:
-        return math.exp(-2.0)
-    twice, rest = 2.0 * ratio * root, 2.0 * ratio**2 - 1.0
-    angle = math.atan2(twice, rest) if ratio < 1.0 else math.atanh(twice / rest)
-    return math.exp(-ratio / root * angle)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
+from hapticbridge.kernel.restitution import NOTABLE_BOUNCE
 from hapticbridge.kernel.rigid_contact import IMPRATIO, MARGIN
 from hapticbridge.units import format_si
 
@@ -43,6 +44,7 @@ class Treatment(NamedTuple):
 
 
 _CONTACTS = "geom, pair, contact"
+_RIGID = f"rigid; a bounce with e >= {NOTABLE_BOUNCE:g} stays, as an impact"
 _IN_STEP = "leaves the coupling out of the implicit step"
 
 TREATMENTS: dict[str, Treatment] = {
@@ -90,7 +92,8 @@ TREATMENTS: dict[str, Treatment] = {
         is_rigid=True,
     ),
     "override softness": Treatment(
-        "option", "o_solref, o_solimp", "without effect", "", "contacts are rigid", is_rigid=True,
+        "option", "o_solref, o_solimp", "changed", _RIGID,
+        "the energy of soft contacts is in no account", is_rigid=True,
     ),
     "wind": Treatment(
         "option", "wind", "kept, and said", "", "no port meters its work",
@@ -146,14 +149,14 @@ TREATMENTS: dict[str, Treatment] = {
         "contacts ahead are seen; without adhesion they give no force",
     ),
     "softness": Treatment(
-        _CONTACTS, "solref, solimp", "changed", "rigid",
+        _CONTACTS, "solref, solimp", "changed", _RIGID,
         "the energy of soft contacts is in no account", is_rigid=True,
     ),
     "friction's softness": Treatment(
         "pair", "solreffriction", "without effect", "", "friction is rigid", is_rigid=True,
     ),
     "limit's softness": Treatment(
-        "joint, spatial, fixed", "solreflimit, solimplimit", "changed", "rigid",
+        "joint, spatial, fixed", "solreflimit, solimplimit", "changed", _RIGID,
         "the energy of soft limits is in no account", is_rigid=True,
     ),
     "equality's softness": Treatment(

@@ -186,7 +186,8 @@ def section() -> Section:
 
     Routh's path with Poisson's or Stronge's end never gains. An impact is part of the
     environment, so its law must be as passive as the integrator. MuJoCo has no law of
-    restitution (its contact is soft), so there is nothing to run in the loop here.
+    restitution (its contact is soft). Rigid contacts take Newton's, as far as the blow pays for it
+    (``kernel.restitution``).
     """
     gains = _random_gains()
     # rounding of two joules that cancel
