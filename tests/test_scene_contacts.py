@@ -390,6 +390,9 @@ BOUNCE = "of a spring → of an impact, e at most"
         ((-4000.0, -10.0), 0.79),
         ((0.01, 0.1), 0.74),
         ((0.02, 1.0), 0.135),
+        ((0.02, 0.0), 0.135),
+        ((0.02, -10.0), 0.135),
+        ((-4000.0, 0.0), 1.0),
         ((-1000.0, -100.0), 0.064),
     ],
 )
@@ -410,7 +413,7 @@ def test_restitution_is_what_mujoco_gives_a_ball(
     ("setting", "said"),
     [
         ('solref="-4000 -10"', f"bounce of geom 'ball': {BOUNCE} 0.79"),
-        ('solref="0.02 0"', f"bounce of geom 'ball': {BOUNCE} 0.98"),
+        ('solref="-4000 0"', f"bounce of geom 'ball': {BOUNCE} 0.98"),
         ('margin="0.005" solref="0.005 1"', ""),
         ('solref="-4000 -10" contype="0" conaffinity="0"', ""),
     ],

@@ -47,7 +47,6 @@ MAX_RESTITUTION = 0.98
 """Largest coefficient of restitution of a rigid contact or limit. It returns 2e/(1 + e) = 0.990 of
 ½‖v⁺ − v‖²_M; a larger one would not be paid for."""
 
-
 PAID = 0.992
 """Share of the energy ½‖v⁺ − v‖²_M of a step that its blows may give back, without unit. The rest
 covers the remainder of the integration."""
@@ -70,17 +69,17 @@ def restitution(first: float, second: float) -> float:
     A spring and damper that only push let go where their force is zero, before the spring is at
     rest: e = exp(−ζ φ/s) with s = √(1 − ζ²), φ = atan2(2ζs, 2ζ² − 1); for ζ > 1 with s = √(ζ² − 1),
     φ = artanh(2ζs/(2ζ² − 1)). Critical damping, MuJoCo's default, has e = exp(−2) = 0.14. Without
-    damping e is 1.
+    damping, e is 1. MuJoCo takes its default for two numbers of different signs.
 
     Args:
         first: Time constant in s of MuJoCo's ``solref``, or −k.
         second: Damping ratio ζ, or −b with ζ = b/(2√k).
     """
     ratio = 1.0
-    if first > 0.0:
-        ratio = max(second, 0.0)
-    elif first < 0.0:
-        ratio = max(-second / (2.0 * math.sqrt(-first)), 0.0)
+    if first > 0.0 and second > 0.0:
+        ratio = second
+    elif first < 0.0 and second <= 0.0:
+        ratio = -second / (2.0 * math.sqrt(-first))
     root = math.sqrt(abs(1.0 - ratio**2))
     if root < 1e-6:
         return math.exp(-2.0)
