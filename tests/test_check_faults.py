@@ -96,6 +96,14 @@ def test_what_is_written_against_creep_ends_it(
     assert bool(creeps(attributes)) is (not attributes or mass < 0.1)
 
 
+@pytest.mark.parametrize("flag", ["frictionloss", "constraint", "limit"])
+def test_dry_friction_that_a_flag_disables_does_not_creep(tmp_path: Path, flag: str) -> None:
+    option = '<option timestep="0.001"'
+    text = RUBS.format(mass=0.2, attributes="").replace(f"{option}/>", f"{option}>{{}}</option>")
+    found = faults_in(tmp_path, text.format(f'<flag {flag}="disable"/>'))
+    assert any(each.kind == "creeping friction" for each in found) is (flag == "limit")
+
+
 def test_mended_scene_has_no_fault(tmp_path: Path) -> None:
     assert faults_of(bench(tmp_path / "scene")) == ()
 

@@ -371,6 +371,25 @@ def test_sources_of_a_specification_are_its_written_form_and_its_assets() -> Non
     assert again.body("tool").mass[0] == pytest.approx(0.1234567890123, rel=1e-5)
 
 
+def test_a_specification_with_a_number_that_no_file_holds_is_refused() -> None:
+    for place, value in (("key_qpos[0, 2]", np.nan), ("body_pos[1, 2]", np.inf)):
+        spec = built_spec()
+        if place.startswith("key"):
+            spec.add_key(name="home", qpos=[0.0, 0.0, value, 1.0, 0.0, 0.0, 0.0])
+        else:
+            spec.body("tool").pos = [0.0, 0.0, value]
+        with pytest.raises(SceneError) as refused:
+            load_scene(spec)
+        assert str(refused.value).startswith(f"{place} of the specification is {value}")
+    spec = built_spec()
+    spec.geoms[0].friction = [np.nan, 1.0, 1.0]
+    with pytest.raises(SceneError, match=r"^geom_friction\[0, 0\] of the specification is nan"):
+        load_scene(spec)
+    spec = built_spec()
+    spec.add_key(name="home", qpos=[0.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0])
+    assert load_scene(spec).data.qpos[2] == 0.5
+
+
 def test_sources_of_a_specification_from_a_file_have_the_files_assets(tmp_path: Path) -> None:
     (tmp_path / "part.obj").write_bytes(obj_bytes())
     path = scene_file(tmp_path, mjcf(MESH.format("part.obj"), MESHED))

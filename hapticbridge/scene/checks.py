@@ -367,6 +367,28 @@ def check_numbers(sources: Iterable[SourceFile]) -> None:
                 )
 
 
+def check_finite(model: mujoco.MjModel) -> None:
+    """Refuses a number of a compiled specification that is not finite.
+
+    MuJoCo writes such a number as 0 or leaves it out, so the scene of the file would be another.
+
+    Raises:
+        SceneError: Names the field of MjModel and the place in it.
+    """
+    names = sorted(dir(model), key=lambda name: name.endswith("0") and name != "qpos0")
+    for name in names:  # what derives from others, as dof_M0, is last
+        values = getattr(model, name, None)
+        if not isinstance(values, np.ndarray) or values.dtype.kind != "f":
+            continue
+        if np.isfinite(values).all():
+            continue
+        place = tuple(int(axis) for axis in np.argwhere(~np.isfinite(values))[0])
+        raise SceneError(
+            f"{name}[{', '.join(map(str, place))}] of the specification is {values[place]}, which "
+            "no MJCF file can hold; write a number"
+        )
+
+
 def _number(word: str) -> float:
     try:
         return float(word)

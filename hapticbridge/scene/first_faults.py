@@ -226,8 +226,10 @@ at 5 N/kg."""
 
 
 def friction_faults(case: CompiledScene) -> Iterator[Fault]:
-    """Yields dry friction that creeps where it should hold."""
-    model = case.model
+    """Yields dry friction that creeps where it should hold; none if a flag disables all of it."""
+    model, disable = case.model, mujoco.mjtDisableBit
+    if model.opt.disableflags & (disable.mjDSBL_FRICTIONLOSS | disable.mjDSBL_CONSTRAINT):
+        return
     reported = set()
     for dof in np.flatnonzero(model.dof_frictionloss > 0).tolist():
         joint, solref = int(model.dof_jntid[dof]), model.dof_solref[dof]

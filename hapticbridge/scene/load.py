@@ -19,6 +19,7 @@ from hapticbridge.arguments import shown
 from hapticbridge.errors import SceneError, SceneWarning, choices, nearest
 from hapticbridge.scene.checks import (
     MAY_BE_ACTIVE,
+    check_finite,
     check_model,
     check_numbers,
     check_options,
@@ -239,11 +240,15 @@ def spec_source(spec: mujoco.MjSpec) -> SceneSource:
     Its path is that of ``MODELNAME.xml`` in ``MjSpec.modelfiledir``; no file needs to exist there.
 
     Raises:
-        SceneError: MuJoCo cannot write the specification, or it has an incompatible option.
+        SceneError: MuJoCo cannot write the specification, a number of it is not finite, or it has
+            an incompatible option.
     """
     path = Path(spec.modelfiledir) / f"{spec.modelname or 'scene'}.xml"
     spec = spec.copy()
-    _name_folders(spec)
+    with suppress(ValueError, mujoco.FatalError):  # the compilation of the scene gives the reason
+        model = spec.compile()
+        check_finite(model)
+        _name_folders(spec, model)
     with _refused(path):
         sources = collect_sources(path, spec.to_xml().encode())
     known = {source.name for source in sources}
@@ -256,25 +261,24 @@ def spec_source(spec: mujoco.MjSpec) -> SceneSource:
     return SceneSource(path, spec, sources, {})
 
 
-def _name_folders(spec: mujoco.MjSpec) -> None:
+def _name_folders(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     """Writes the whole path of each asset of a part that was attached from another folder.
 
-    MuJoCo finds such a file beside the part, but writes its name alone.
+    MuJoCo finds such a file beside the part, but writes its name alone. ``model`` is the compiled
+    specification.
     """
-    with suppress(ValueError, mujoco.FatalError):  # the compilation of the scene gives the reason
-        model = spec.compile()
-        for elements, places, folder in (
-            (spec.meshes, model.mesh_pathadr, spec.meshdir),
-            (spec.hfields, model.hfield_pathadr, spec.meshdir),
-            (spec.textures, model.tex_pathadr, spec.texturedir),
-            (spec.skins, model.skin_pathadr, spec.meshdir),
-        ):
-            for element in elements:
-                start = int(places[element.id])
-                found = Path(model.paths[start:].partition(b"\0")[0].decode())
-                own = Path(spec.modelfiledir, folder, element.file)
-                if start >= 0 and found.is_file() and found.absolute() != own.absolute():
-                    element.file = str(found.absolute())
+    for elements, places, folder in (
+        (spec.meshes, model.mesh_pathadr, spec.meshdir),
+        (spec.hfields, model.hfield_pathadr, spec.meshdir),
+        (spec.textures, model.tex_pathadr, spec.texturedir),
+        (spec.skins, model.skin_pathadr, spec.meshdir),
+    ):
+        for element in elements:
+            start = int(places[element.id])
+            found = Path(model.paths[start:].partition(b"\0")[0].decode())
+            own = Path(spec.modelfiledir, folder, element.file)
+            if start >= 0 and found.is_file() and found.absolute() != own.absolute():
+                element.file = str(found.absolute())
 
 
 def _written(source: SceneSource) -> SceneSource:
