@@ -57,3 +57,13 @@ def test_an_audit_and_a_recording_name_their_file(run: tuple[hb.Summary, Path]) 
     assert words[0] == "a<b>&.mcap"
     assert "0.200 s, 200 ticks" in words
     assert words[words.index("scene") + 1] == "virtual_wall"
+
+
+def test_a_recording_that_lost_its_metadata_has_no_time(
+    run: tuple[hb.Summary, Path], tmp_path: Path
+) -> None:
+    data, path = bytearray(run[1].read_bytes()), tmp_path / "torn.mcap"
+    data[9:17] = (1 << 63).to_bytes(8, "little")  # the length of the first record
+    path.write_bytes(data)
+    assert "200 ticks" in Seen(hb.read_recording(path)).words
+    assert "0.200 s, 200 ticks" in Seen(hb.read_recording(run[1])).words

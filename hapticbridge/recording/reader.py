@@ -380,7 +380,9 @@ class Recording(RecordingFile):
         """Returns length, origin and damage as HTML, for a notebook."""
         rows = [(name, self.meta.get(name, "")) for name in ("scene", "grip", "method", "started")]
         rows = [row for row in rows if row[1]]
-        rows.append(("ran", f"{len(self.ticks) * self.period:.3f} s, {len(self.ticks)} ticks"))
+        period, count = self.period, len(self.ticks)
+        time = f"{count * period:.3f} s, " if math.isfinite(period) else ""
+        rows.append(("ran", f"{time}{count} ticks"))
         rows.append(("events", str(len(self.events))))
         return facts_html(self.path.name, rows, (*self.problems, self.cut_sentence))
 
