@@ -188,6 +188,20 @@ def cut_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return cut
 
 
+def test_a_file_cut_before_its_first_tick_does_not_speak_of_the_run(
+    call: Called, cut_file: Path, tmp_path: Path
+) -> None:
+    early = tmp_path / "early.mcap"
+    early.write_bytes(cut_file.read_bytes()[:5000])
+    code, out, _ = call("audit", early)
+    assert code == 1
+    assert "the recording is empty: it holds no tick" in out
+    assert "the file is cut: its end is missing" in out
+    code, _, err = call("render", early, tmp_path / "early.png")
+    assert code == 2
+    assert "it holds no tick" in err
+
+
 def test_cut_file_is_called_cut_and_repaired(call: Called, cut_file: Path, tmp_path: Path) -> None:
     cut, mended = cut_file, tmp_path / "mended.mcap"
     code, out, _ = call("audit", cut)

@@ -404,6 +404,17 @@ def test_a_tool_with_a_motor_of_its_own_stays_implicit(joint: str) -> None:
     assert is_free.any() == (joint == "elsewhere")
 
 
+@pytest.mark.parametrize("by_actuator", ["true", "false"])
+def test_a_weight_that_an_actuator_carries_stays_implicit(by_actuator: str) -> None:
+    xml = f"""<mujoco><option gravity="0 0 -9.81"/><worldbody><body gravcomp="1">
+        <joint type="slide" axis="0 0 1" actuatorgravcomp="{by_actuator}"/>
+        <geom size="0.01" mass="0.1"/><site name="grip"/></body></worldbody></mujoco>"""
+    rows, ledger = led(load(xml), "lossless", ASKED, circling(T, 4.0), T)
+    assert ledger.environment == "strict", rows["environment_energy"].max()
+    is_free = (rows["flags"] & int(TickFlag.MIDPOINT)) != 0
+    assert is_free.any() == (by_actuator == "false")
+
+
 # --- changing over --------------------------------------------------------------------------------
 
 

@@ -98,7 +98,7 @@ def file_fault(recording: RecordingFile) -> Fault | None:
     if recording.problems:
         return Fault("the file is damaged: " + "; ".join(recording.problems))
     if not recording.count:
-        return Fault("the recording is empty: the run had no tick")
+        return Fault("the recording is empty: it holds no tick")
     last = recording.last_tick
     # the last rows may be lost although a later event is kept, if that was in an earlier chunk
     may_lack = recording.is_cut or any(e.get("event") == "repaired" for e in recording.events)

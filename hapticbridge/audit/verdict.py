@@ -372,7 +372,7 @@ def decide(
         strict: True accepts only (14) itself, not the slack that the device condition leaves.
     """
     if fault is not None or energies is None:
-        fault = fault or Fault("the recording is empty: the run had no tick")
+        fault = fault or Fault("the recording is empty: it holds no tick")
         return replace(
             report,
             sentence=fault.reason,

@@ -593,7 +593,10 @@ def _is_driven(model: mujoco.MjModel, bodies: NDArray[np.bool_], own: Container[
 
     MuJoCo applies the whole force of an actuator in a step that is due half of it, and a servo's
     force implicitly. Beside a lossless coupling that creates energy: 8 mJ in 1 s as measured.
+    Gravity compensation of a joint's actuators (``actuatorgravcomp``) is such a force, too.
     """
+    if model.ngravcomp and np.any(model.jnt_actgravcomp[bodies[model.jnt_bodyid]]):
+        return True
     transmission = mujoco.mjtTrn
     owner = {
         transmission.mjTRN_JOINT: model.jnt_bodyid,

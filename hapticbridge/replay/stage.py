@@ -139,7 +139,7 @@ class Stage:
         self.recording: RecordingFile = opened
         reason = obstacle(self.recording)
         if not self.recording.count:
-            reason = "it is empty: the run had no tick"
+            reason = "it is empty: it holds no tick"
         if reason:
             raise RecordingError(f"'{opened.path}' cannot be drawn: {reason}")
         self._hands = tuple(AuditedRun.of(each).parameters for each in hands)

@@ -371,7 +371,7 @@ def telling_time(recording: Recording, report: AuditReport | None = None) -> flo
         RecordingError: The recording has no tick or no period.
     """
     if not len(recording.ticks):
-        raise RecordingError(f"'{recording.path}' is empty: the run had no tick")
+        raise RecordingError(f"'{recording.path}' is empty: it holds no tick")
     tick = None if report is None else report.tick
     if tick is None:
         tick = int(np.argmax(np.linalg.norm(recording.ticks["wrench_on_tool"][:, :3], axis=1)))
