@@ -526,3 +526,29 @@ def test_what_is_refused_is_refused(tmp_path: Path, subject: str) -> None:
     path.write_text(REFUSED[subject])
     with pytest.raises(hb.SceneError, match=subject):
         hb.load_scene(path)
+
+
+WITHOUT_MOTOR = """<mujoco>{}<worldbody><body name="tool" gravcomp="1">
+<joint name="h" type="slide" axis="0 0 1" actuatorgravcomp="true"/><geom size=".015" mass=".1"/>
+<site name="grip"/></body></worldbody></mujoco>"""
+MOTOR, FLAG = '<actuator><motor joint="h"/></actuator>', '<flag actuation="disable"/>'
+
+
+@pytest.mark.parametrize(
+    ("more", "falls"),
+    [("", True), (MOTOR, False), (f"<option>{FLAG}</option>{MOTOR}", True)],
+    ids=["no actuator", "an actuator", "the flag"],
+)
+def test_gravity_compensation_that_mujoco_alone_does_not_give_is_said(
+    tmp_path: Path, more: str, falls: bool
+) -> None:
+    text = WITHOUT_MOTOR.format(more)
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 100)
+    assert bool(data.qpos[0] < -0.1) is falls
+    path = tmp_path / "scene.xml"
+    path.write_text(text, encoding="utf-8")
+    said = [change.words for change in hb.load_scene(path).differences]
+    words = "gravity compensation of joint 'h': none without an actuator → given"
+    assert (words in said) is falls

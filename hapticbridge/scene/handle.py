@@ -434,6 +434,22 @@ def limit_motors_alone(
     return (SceneChange(words, "joint's force limit"),)
 
 
+def announce_gravity_compensation(model: mujoco.MjModel) -> tuple[SceneChange, ...]:
+    """Returns the change for joints whose actuators compensate gravity without there being any.
+
+    MuJoCo gives ``actuatorgravcomp`` in the stage of actuators, which it leaves out for a scene
+    without one and where the flag disables them; the coupling brings the stage back.
+    """
+    joints = np.flatnonzero(model.jnt_actgravcomp).tolist() if model.ngravcomp else []
+    is_off = model.opt.disableactuator == (1 << GROUPS) - 1  # for the flag, ``set_options``
+    if not joints or not (is_off or model.nactuator == len(added_actuators(model))):
+        return ()
+    name = model.joint(joints[0]).name or str(joints[0])
+    more = f" and {len(joints) - 1} more" if len(joints) > 1 else ""
+    words = f"gravity compensation of joint '{name}'{more}: none without an actuator → given"
+    return (SceneChange(words, "joint's gravity compensation"),)
+
+
 HELD = 1e-6
 """Way of a grip in a motion of unit size, in m, below which constraints hold it. Rounding leaves
 1e-12 of way; a softer hinge of the tool moves by its lever, of a mm or more."""

@@ -39,6 +39,7 @@ from hapticbridge.scene.compile import (
 from hapticbridge.scene.grip import add_grip
 from hapticbridge.scene.handle import (
     LET_GO,
+    announce_gravity_compensation,
     announce_overlaps,
     attach_handles,
     exclude_nested,
@@ -407,6 +408,7 @@ def compile_scene(
         scene.reset()
         for each in dict.fromkeys(grips):
             scene.differences += limit_motors_alone(model, scene.data, each, as_is=as_is)
+        scene.differences += announce_gravity_compensation(model)
     if checks_start:
         check_start(scene.data, grips[0])
     if as_is:

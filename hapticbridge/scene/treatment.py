@@ -168,6 +168,10 @@ TREATMENTS: dict[str, Treatment] = {
         "the same limit on its actuators, of joints that carry the grip",
         "it would cap the coupling", stops=True,
     ),
+    "joint's gravity compensation": Treatment(
+        "joint", "actuatorgravcomp", "changed", "given without an actuator, too",
+        "the coupling is made of actuators",
+    ),
     "edges": Treatment(
         "edge", "stiffness, damping", "changed", "constraints of constant length; no damping",
         "the implicit integrator lacks them", stops=True,
