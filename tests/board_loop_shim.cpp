@@ -151,7 +151,7 @@ void wall(const double* numbers, int is_on_board, double* found) {
 }
 
 // A whole board, which a host knows by its frames alone. numbers: damping, friction, step, largest
-// force and speed, mass.
+// force and speed, mass, time from a position to its force.
 HbBoard* board_new(int axes, float period, const float* numbers) {
   HbSheet sheet;
   memset(&sheet, 0, sizeof sheet);
@@ -171,7 +171,7 @@ HbBoard* board_new(int axes, float period, const float* numbers) {
     sheet.damping = sheet.mass = sheet.friction = sheet.resolution = sheet.force_limit = NAN;
   }
   sheet.delay = period;
-  sheet.loop_delay = 1e-5f;
+  sheet.loop_delay = numbers[6];
   sheet.name = "board";
   return new HbBoard(sheet, period);
 }

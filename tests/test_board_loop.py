@@ -365,7 +365,7 @@ class Board:
     """A board in virtual time, whose handle is where ``position`` says."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
-        self._library, numbers = library, floats([2.0, 0.0, 0.0, 5.0, 5.0, 0.1])
+        self._library, numbers = library, floats([2.0, 0.0, 0.0, 5.0, 5.0, 0.1, 1e-5])
         self._board = ctypes.c_void_p(library.board_new(0b111, ctypes.c_float(PERIOD), numbers))
         self.position, self.force, self.now = np.zeros(3), np.zeros(3), 0
         self.status = 0

@@ -478,9 +478,8 @@ def test_a_board_with_a_loop_renders_a_wall_behind_pyserial(fast_board: Board) -
     calls = itertools.count()
 
     def felt() -> float:
-        if next(calls) % 5:  # a frame that has not left is replaced by the next one
-            device.show(wall)
-        else:
+        device.show(wall)
+        if next(calls) % 5 == 0:
             device.set_loop(BoardSetting(5e3, 0.0, 2.0, 0.0, 0.01))
         device.read(sample)
         return 0.0 if device.loop_state is None else device.loop_state.force[0]

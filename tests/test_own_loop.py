@@ -49,8 +49,9 @@ class Bench:
     ) -> None:
         self.scene, own = hb.load_scene(scene), sheet or BoardSheet()
         hand = hand_for(self.scene)
+        friction = 0.1 if np.isnan(own.friction) else own.friction
         mechanics = SimulatedDevice(
-            hand=hand, mass=own.mass, damping=own.damping, friction=own.friction
+            hand=hand, mass=own.mass, damping=own.damping, friction=friction
         )
         self.mechanics, self.board = mechanics, LoopBoard(library, mechanics, own, link)
         self.seam = HidSeam(self.board)
@@ -494,3 +495,23 @@ def test_a_silence_accuses_no_board(library: ctypes.CDLL, tmp_path: Path) -> Non
     assert (report.verdict, report.agreement) == ("passive", "bit for bit")
     assert report.certification is not None
     assert report.certification.verdict is True
+
+
+def test_a_loop_that_does_not_state_its_delay_is_refused(library: ctypes.CDLL) -> None:
+    for unknown in (0.0, float("nan")):
+        sheet = BoardSheet(loop_delay=unknown)
+        with pytest.raises(DeviceError, match="does not state its loop_delay"):
+            Bench(library, sheet=sheet)
+        assert Bench(library, sheet=sheet, loop_rate=0.0).device.info.loop_period is None
+        stated = Bench(library, sheet=sheet, loop_delay=3e-5).device.info
+        assert (stated.loop_period, stated.loop_delay) == (1e-4, 3e-5)
+
+
+def test_a_certificate_with_unknown_friction_says_so_in_its_first_line(
+    library: ctypes.CDLL,
+) -> None:
+    bench = Bench(library, sheet=BoardSheet(friction=float("nan")))
+    with bench.bridge({"stiffness": 1e3, "damping": 0.0}) as bridge:
+        summary = bridge.run(0.5)
+    assert summary.is_certified
+    assert summary.headline.endswith(", if its friction holds the encoder's steps")

@@ -390,7 +390,8 @@ def _both_lowered(loop: LoopSetting, axis: Axis, share: float) -> str:
     prefix, spring, damper = _SETTINGS[axis]
     gains = (share * gain for gain in _gains(loop.requested(loop.law), axis))
     k, b = (_three_digits(gain) for gain in gains)
-    return f"lower the {prefix}stiffness to {k} {spring} and the damping to {b} {damper}"
+    both = f" and the damping to {b} {damper}" if _gains(loop.law, axis)[1] > 0.0 else ""
+    return f"lower the {prefix}stiffness to {k} {spring}{both}"
 
 
 def _remedy(loop: LoopSetting, axis: Axis, available: float) -> str:

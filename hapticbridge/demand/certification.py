@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import Any
 
-from hapticbridge.demand.certificate import DampingCondition, is_run_certified, run_conditions
+from hapticbridge.demand.certificate import (
+    DampingCondition,
+    StepCondition,
+    is_run_certified,
+    run_conditions,
+)
 from hapticbridge.demand.methods import Method
 from hapticbridge.demand.own_loop import OwnLoopAccount
 from hapticbridge.demand.timekeeping import NOT_KEPT, RunTimes, Timekeeping, silence_in
@@ -126,8 +131,7 @@ class Certification:
         if self.standing is Standing.NO_HAND:
             return f"the device {_NO_HAND}"
         if self.verdict:
-            steps = [each.steps for each in self.conditions if each.steps is not None]
-            open_steps = next((each for each in steps if each.holds is None), None)
+            open_steps = next(self._open_steps, None)
             limits = "" if open_steps is None else f"; its encoder's steps are {open_steps.word}"
             limits += f", but {self.energy.limit}" if self.energy.limit else ""
             limits += self._untold
@@ -135,6 +139,17 @@ class Certification:
         if self.verdict is None:
             return f"device not judged: {_OPEN[self.standing]}{self.kept.slowness}"
         return f"device not certified: {self._cause}"
+
+    @property
+    def _open_steps(self) -> Iterator[StepCondition]:
+        """Conditions on encoder steps of which step or friction is unknown."""
+        steps = (each.steps for each in self.conditions if each.steps is not None)
+        return (each for each in steps if each.holds is None)
+
+    @property
+    def has_open_steps(self) -> bool:
+        """True if it is not known whether friction holds the encoder's steps."""
+        return any(True for _ in self._open_steps)
 
     @property
     def _cause(self) -> str:

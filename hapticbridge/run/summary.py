@@ -348,6 +348,8 @@ class Summary:
             return "passive: the scene gave out no more energy than it got"
         if self.is_certified:
             more = f", and {format_energy(self.credit)}" if self.credit else ""
+            if self.certification.has_open_steps:
+                more += ", if its friction holds the encoder's steps"
             more += ", apart from what motors and inputs gave" if self.hand_energy.limit else ""
             return (
                 "passive, and certified: no hand gets more energy than it puts in or the scene "

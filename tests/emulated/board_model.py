@@ -32,6 +32,7 @@ class BoardSheet:
     force_limit: float = 10.0
     speed_limit: float = 5.0
     mass: float = 0.1
+    loop_delay: float = 1e-5
 
 
 class LoopBoard(HidDevice):
@@ -68,7 +69,7 @@ class LoopBoard(HidDevice):
         own = self.sheet
         self._turns = own.axes & 0b111 == 0
         numbers = [own.damping, own.friction, own.resolution]
-        numbers += [own.force_limit, own.speed_limit, own.mass]
+        numbers += [own.force_limit, own.speed_limit, own.mass, own.loop_delay]
         new = library.board_new(own.axes, ctypes.c_float(own.period), floats(numbers))
         self._board = ctypes.c_void_p(new)
         self._mechanics, self._sample = mechanics, mechanics.start(own.period)

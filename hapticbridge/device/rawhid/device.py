@@ -87,7 +87,7 @@ POLLING = 1e-3
 """Polling interval of a full-speed device in s, in each direction."""
 
 _MUST_SAY, _GRIP_MUST_SAY = ("rate", "speed_limit"), ("force_limit", "speed_limit")
-_FIXED = ("axes", "rate", "delay", "loop_delay")
+_FIXED = ("axes", "rate", "delay")
 CHANGES = tuple(name for name in Numbers._fields if name not in _FIXED)
 """Numbers of the data sheet that the user may replace."""
 GRIP_CHANGES = ("grip_mass", "grip_damping", "grip_force_limit")
@@ -174,7 +174,9 @@ def data_sheet(
     if missing := [field for field in must if known[field] is None]:
         raise DeviceError(f"{name} does not report its {missing[0]}, which is required")
     delay = known.pop("delay")
-    known |= _own_loop(known.pop("loop_rate"), known["loop_delay"], axes, has_grip=grip is not None)
+    known |= _own_loop(
+        name, known.pop("loop_rate"), known["loop_delay"], axes, has_grip=grip is not None
+    )
     values: dict[str, Any] = {} if grip is None else grip.known() | of_grip
     if missing := [each for each in _GRIP_MUST_SAY if each in values and values[each] is None]:
         raise DeviceError(f"{name} does not report its grip's {missing[0]}, which is required")
@@ -193,12 +195,22 @@ def data_sheet(
 
 
 def _own_loop(
-    rate: float | None, delay: float | None, axes: tuple[str, ...], *, has_grip: bool
+    name: str, rate: float | None, delay: float | None, axes: tuple[str, ...], *, has_grip: bool
 ) -> dict[str, float | None]:
-    """Returns period and delay of a board's own loop, for a handle on lines or about one axis."""
+    """Returns period and delay of a board's own loop, for a handle on lines or about one axis.
+
+    Raises:
+        DeviceError: The delay is unknown, with which the condition could not be judged.
+    """
     if not rate or has_grip or not (set(axes) <= set(AXES[:3]) or len(axes) == 1):
         return {"loop_period": None, "loop_delay": 0.0}
-    return {"loop_period": 1.0 / rate, "loop_delay": delay or 0.0}
+    if not delay:
+        raise DeviceError(
+            f"{name} has a loop of its own and does not state its loop_delay, the time in s from "
+            "reading a position to its force: name it, or leave the coupling to the bridge's loop "
+            "with loop_rate=0"
+        )
+    return {"loop_period": 1.0 / rate, "loop_delay": delay}
 
 
 # State frames of a raw HID device

@@ -34,6 +34,7 @@ inline HbSheet hb_unknown_sheet() {
   memset(&sheet, 0, sizeof sheet);
   sheet.mass = sheet.damping = sheet.friction = sheet.resolution = sheet.delay = NAN;
   sheet.rotational_inertia = sheet.rotational_damping = sheet.torque_limit = NAN;
+  sheet.loop_delay = NAN;
   return sheet;
 }
 
