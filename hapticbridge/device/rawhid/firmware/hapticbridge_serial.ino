@@ -11,8 +11,9 @@
 // FILL IN the device. The numbers here are an example: MEASURE YOURS. This sketch has not been
 // verified on hardware. hapticbridge guide stiff-device goes through it.
 //
-// Before the first run: paddle unloaded, hand on the power switch, duty limit at 0.2. Push the
-// paddle: if it runs away instead of resisting, swap the motor's wires or write_force()'s sign.
+// Before the first run: paddle unloaded, hand on the power switch, duty limit at 0.2. Without
+// a host there is no force. The first run pushes gently and stops if the motor goes the wrong way:
+// then swap its wires, or the sign in write_force().
 
 #include <math.h>
 #include <string.h>
