@@ -93,13 +93,16 @@ def free_rawhid(serial: str = "R1") -> RawHid:
 def board(library: ctypes.CDLL) -> LoopBoard:
     """Returns a home-made device with a loop of its own, in a hand that taps on a wall.
 
-    The hand rests for 0.6 s, then goes out along x and back within 0.6 s.
+    The hand rests for 0.9 s, then goes out along x and back within 0.3 s, at no time so slowly that
+    a run would begin out there.
     """
-    times = np.arange(0.0, 60.0, 0.02)
-    out = np.maximum(np.mod(times, 1.2) / 0.6 - 1.0, 0.0)
+    times = np.arange(0.0, 60.0, 0.01)
+    out = np.maximum(np.mod(times, 1.2) / 0.3 - 3.0, 0.0)
     places = np.zeros((len(times), 3))
-    places[:, 0] = 0.015 * np.sin(np.pi * out) ** 2
-    mechanics = SimulatedDevice(mass=0.1, damping=2.0, friction=0.1, path=Motion(times, places))
+    places[:, 0] = 0.02 * np.sin(np.pi * out) ** 2
+    mechanics = SimulatedDevice(
+        mass=0.1, damping=2.0, friction=0.1, hand=FIRM, path=Motion(times, places)
+    )
     # slow enough for this process on a wall clock
     return LoopBoard(library, mechanics, BoardSheet(period=2.5e-4))
 
