@@ -299,7 +299,8 @@ class RerunSink:
         try:
             self._stream.flush(timeout_sec=_FLUSH_TIME)
         except RuntimeError:  # its writer's thread has ended
-            # releasing the stream would wait for that thread, perhaps for ever
+            # releasing the stream would wait for that thread, perhaps for ever; so would the exit
+            self._rerun.unregister_shutdown()
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._stream))
             raise OSError(_IN_PART) from None
 
