@@ -199,7 +199,10 @@ class Compiled(Deferred):
         code = b""
         if sys.platform == "linux":
             code = self._object_code(arguments, c_types)
-        return machine_code.address_of(code, self._function.__name__) if code else self._c(c_types)
+        with suppress(RuntimeError):  # the linker refuses it
+            if code:
+                return machine_code.address_of(code, self._function.__name__)
+        return self._c(c_types)
 
     def _c(self, c_types: tuple[str, ...]) -> int:
         numba, called = import_module("numba"), self.built
@@ -234,9 +237,9 @@ class Compiled(Deferred):
         if code is None and folder is not None:
             code = machine_code.read(folder / name)
         if code is None:
-            code = machine_code.object_code(self.program(arguments, c_types))
-            code = machine_code.usable(code, name)
-            if folder is not None:
+            program = self.program(arguments, c_types)
+            code = machine_code.object_code(program)
+            if folder is not None and (code or not program):  # no room now may be room later
                 machine_code.write(folder / name, code)
         return code
 
@@ -349,8 +352,8 @@ def prepare(programs: Sequence[Program], note: Callable[[int], None]) -> None:
                 raise
         for name in missing:
             with suppress(FileNotFoundError):  # the child was ended; compiled when it is needed
-                code = machine_code.usable(Path(place, name).read_bytes(), name)
-                machine_code.write(folder / name, code)
+                if code := Path(place, name).read_bytes():
+                    machine_code.write(folder / name, code)
 
 
 READY_MADE = Path(__file__).parents[1] / "ready_made"

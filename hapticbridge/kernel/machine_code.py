@@ -194,20 +194,13 @@ def object_code(bitcode: bytes) -> bytes:
         return b""
 
 
-def usable(code: bytes, name: str) -> bytes:
-    """Returns the code, or none if the linker refuses it."""
-    try:
-        address_of(code, name)
-    except RuntimeError:
-        return b""
-    return code
-
-
 def serve() -> None:
     """Compiles the programs in the files named on standard input, each into a file beside it."""
     for line in sys.stdin:
         path = Path(line.rstrip("\n"))
-        path.with_suffix(".o").write_bytes(object_code(path.read_bytes()))
+        made = path.with_suffix(".part")
+        made.write_bytes(object_code(path.read_bytes()))
+        made.replace(path.with_suffix(".o"))
 
 
 def _entry(symbol: str, kinds: Sequence[Kind], result: str, releases_lock: bool) -> str:
