@@ -61,6 +61,16 @@ def ramp(count: int = 5, start: int = 10**18, late: int = 7) -> list[tuple[int, 
     return [(at + late, pose_message(at, 1e-3 * i)) for i, at in enumerate(stamps)]
 
 
+def write_ramp(writer: Any) -> None:
+    """Writes a whole bag of poses on ``/hand``."""
+    writer.start("ros2", "a test")
+    schema = writer.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", b"")
+    channel = writer.register_channel("/hand", "cdr", schema)
+    for time, data in ramp():
+        writer.add_message(channel, time, data, time)
+    writer.finish()
+
+
 @pytest.mark.parametrize("is_folder", [False, True])
 def test_a_bag_of_poses_is_a_motion(tmp_path: Path, *, is_folder: bool) -> None:
     folder = bag(tmp_path / "walk", {"/hand": ramp()})
@@ -152,12 +162,7 @@ def test_a_bag_without_an_index_or_topics_in_it_is_read(
             repeat_schemas=False,
             use_summary_offsets=False,
         )
-        writer.start("ros2", "a test")
-        schema = writer.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", b"")
-        channel = writer.register_channel("/hand", "cdr", schema)
-        for time, data in ramp():
-            writer.add_message(channel, time, data, time)
-        writer.finish()
+        write_ramp(writer)
     device = open_device(f"trajectory:{path}")
     assert device.info.duration == pytest.approx(0.04)
     with pytest.raises(RecordingError, match=r"it has no topic /tick$"):  # and no damage
@@ -202,12 +207,7 @@ def test_a_bag_with_a_changed_byte_is_refused_or_gives_the_same_motion(
     path = tmp_path / "hand.mcap"
     with path.open("wb") as file:
         writer: Any = McapWriter(file, compression=compression)
-        writer.start("ros2", "a test")
-        schema = writer.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", b"")
-        channel = writer.register_channel("/hand", "cdr", schema)
-        for time, data in ramp():
-            writer.add_message(channel, time, data, time)
-        writer.finish()
+        write_ramp(writer)
     whole, right = path.read_bytes(), read_bag(path).table
     refused = 0
     for place in range(8, len(whole), 3):

@@ -28,7 +28,6 @@ COUNTERS = ("changes", "ticks", "missed")
 ROUNDING = 1e-6
 """Energy in J by which Σ P may pass its bound: the loop adds in single precision."""
 
-
 UNCOUNTED = 1.0
 """Time in s at the ends of a run that counters of the loop may lack: they come about 30 times per
 second, and a link may lose some. A larger one certifies longer runs without any."""
