@@ -28,7 +28,7 @@ class Coupling:
 
     and the device receives −f_k, −τ_k. All quantities are in the world frame: pose h of the handle
     and x of the grip, their orientations R, their rotation vectors δφ since the previous tick. T is
-    the period in s. The rotational spring is convex for |φ| < π; beyond, it jumps.
+    the period in s. The rotational spring is convex for −π < φ < π; beyond, it jumps.
 
     Attributes:
         stiffness: Stiffness K of the coupling in N/m. A run without it takes the stiffest that
