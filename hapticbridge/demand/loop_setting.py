@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.coupling import Coupling
+from hapticbridge.coupling import Axis, Coupling
 from hapticbridge.demand.methods import IMPLICIT, Method
 from hapticbridge.device.base import DeviceInfo
 from hapticbridge.errors import CouplingError
@@ -17,8 +16,6 @@ from hapticbridge.kernel.ledger import SLACK_SHARE
 from hapticbridge.kernel.parameters import ROUNDING, RunParameters, checked_substeps, whole_ticks
 from hapticbridge.theory.bounds import minimum_damping
 from hapticbridge.theory.transfer import CouplingGrid, delayed_by
-
-Axis = Literal["translation", "rotation"]
 
 # Time in which a device answers
 
