@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import stat
 import struct
@@ -104,12 +105,16 @@ def _read_lines(path: Path) -> list[str]:
         if not stat.S_ISREG(mode):
             kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
             raise DeviceError(f"{path}: is {kind}, not a CSV file")
-        return path.read_text(encoding="utf-8-sig").split("\n")
+        # a spreadsheet's "Unicode text" is UTF-16, and begins with its byte-order mark
+        with path.open("rb") as file:
+            is_wide = file.read(2) in {codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE}
+        return path.read_text(encoding="utf-16" if is_wide else "utf-8-sig").split("\n")
     except FileNotFoundError:
         raise DeviceError(f"{path}: no such file") from None
     except UnicodeDecodeError as error:
         line = path.read_bytes()[: error.start].count(b"\n") + 1
-        raise DeviceError(f"{path}, line {line}: not UTF-8 text, so not a CSV file") from None
+        kind = "-".join(error.encoding.upper().split("-")[:2])
+        raise DeviceError(f"{path}, line {line}: not {kind} text, so not a CSV file") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise DeviceError(f"{path}: cannot be read ({reason})") from None
