@@ -149,7 +149,7 @@ class Certification:
     @property
     def has_open_steps(self) -> bool:
         """True if it is not known whether friction holds the encoder's steps."""
-        return any(True for _ in self._open_steps)
+        return next(self._open_steps, None) is not None
 
     @property
     def _cause(self) -> str:
