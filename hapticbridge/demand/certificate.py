@@ -309,7 +309,7 @@ class DampingCondition:
             text = f"{text} in its own loop of {period}, with {format_si(self.delay or 0.0, 's')} "
             text += "from a position to its force"
         elif self.delay is None:
-            text = f"{text}, if it answers without delay, which is unknown"
+            text = text.replace(": ", ": its delay is unknown; without one, ", 1)
         elif self.delay:
             text = f"{text} with its delay of {format_si(self.delay, 's')}"
         text += self.clause
@@ -341,7 +341,7 @@ def _condition(loop: LoopSetting, axis: Axis, available: float | None) -> Dampin
     if available is not None and available < needed:
         remedy = _remedy(loop, axis, available)
     unconfirmed, lag = None, assumed_lag(loop.info, loop.period)
-    if lag != loop.lag:
+    if lag != loop.lag and loop.info.delay is not None:
         bears = available is not None and available >= loop.needed(axis, lag)
         unconfirmed = lag.delay if bears else loop.lag.delay
     return DampingCondition(
