@@ -163,6 +163,32 @@ def test_what_cannot_be_learned_from_is_refused_and_leaves_nothing(
     assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap", "other.mcap", "set"]
 
 
+def test_a_programs_run_has_its_tool_and_says_where_it_was_placed_anew(
+    call: Called, tmp_path: Path
+) -> None:
+    path = tmp_path / "own.mcap"
+    with hb.DeviceLoop("simulated", recording=path, is_simulated=True) as device:
+        for place in (0.0, 0.05):
+            device.show([place, 0.0, 0.0], is_placed=True)
+            for _ in range(10):
+                device.advance(0.02)
+                device.show([place, 0.0, 0.0])
+    events = hb.audit(path, in_process=True).events
+    assert (events["placed"] >= 2, "reset" in events) == (True, False)
+    assert 20 <= events["shown"] <= 22
+    folder = tmp_path / "set"
+    code, _, err = call("export", path, "--format", "lerobot", "--out", folder)
+    assert code == 0
+    jumps = write_dataset([path], "lerobot", tmp_path / "again").resets[0]
+    assert [pytest.approx(time, abs=2e-3) for time in jumps] == [0.2]
+    assert f"was reset at {jumps[0]:.3f} s: its episode jumps there" in " ".join(err.split())
+    columns = lerobot(folder, 0)
+    assert "observation.qpos" not in columns
+    state = np.array(columns["observation.state"])
+    assert state[0, 0] == 0.0
+    assert state[-1, 0] == pytest.approx(0.05)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

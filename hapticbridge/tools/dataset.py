@@ -36,6 +36,8 @@ from hapticbridge.kernel.record import force_on_hand
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.ros_messages import axes_of
 from hapticbridge.replay.film import Shot, states
+from hapticbridge.run.description import meta_float
+from hapticbridge.tools.export import time_of
 
 POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
@@ -110,9 +112,11 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
         SENSORS: tuple(found["sensor_names"]),
         ACTION: (*POSE, *WRENCH),
     }
-    for column in (CTRL, SENSORS):
-        if not names[column]:
-            del values[column], names[column]
+    left_out = [column for column in (CTRL, SENSORS) if not names[column]]
+    if meta_float(recording.meta, "credit") > 0.0:  # the scene is the shown tool alone
+        left_out.append(QPOS)
+    for column in left_out:
+        del values[column], names[column]
     return Episode(
         name=name,
         scene=recording.meta.get("scene", ""),
@@ -412,10 +416,12 @@ class WrittenDataset:
     Attributes:
         folder: The data set.
         episodes: Number of frames of each episode.
+        resets: Times in s within each episode at which the scene was reset, so that it jumps.
     """
 
     folder: Path
     episodes: tuple[int, ...]
+    resets: tuple[tuple[float, ...], ...]
 
 
 def write_dataset(
@@ -468,7 +474,16 @@ def write_dataset(
         raise RecordingError(f"cannot write '{folder}': {reason_of(error, folder)}") from None
     finally:
         shutil.rmtree(draft, ignore_errors=True)
-    return WrittenDataset(folder, tuple(counts))
+    return WrittenDataset(folder, tuple(counts), tuple(map(_resets, recordings)))
+
+
+def _resets(recording: RecordingFile) -> tuple[float, ...]:
+    """Returns the times in s of the resets of a run; its tool is placed in the first two ticks."""
+    return tuple(
+        time_of(event)
+        for event in recording.events
+        if event.get("event") == "reset" and event.get("tick", 0) > 1
+    )
 
 
 def _sound(recording: RecordingFile) -> RecordingFile:
