@@ -258,6 +258,26 @@ def test_results_are_printed_whatever_the_terminal_states(setting: str, tmp_path
     assert PRINTED[setting] in done.stdout.decode(encoding)
 
 
+@pytest.mark.parametrize("setting", ["backend: nonsense", "text.usetex: True", "MPLBACKEND"])
+def test_pictures_are_drawn_with_the_users_settings_or_what_fails_is_told(
+    setting: str, tmp_path: Path
+) -> None:
+    (tmp_path / "rc").write_text("" if setting == "MPLBACKEND" else setting)
+    picture = tmp_path / "a.png"
+    words = ["zwidth", "--damping", "2", "--plot", str(picture)]
+    environment = os.environ | {"MATPLOTLIBRC": str(tmp_path / "rc"), "PATH": ""}
+    environment |= {"MPLBACKEND": "nonsense"} if setting == "MPLBACKEND" else {}
+    command = [sys.executable, "-m", "hapticbridge", *words]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert "Traceback" not in done.stderr
+    if setting == "text.usetex: True":
+        assert (done.returncode, picture.exists()) == (2, False)
+        sentence = f"set text.usetex: False in '{tmp_path / 'rc'}'"
+        assert one_sentence(done.stderr).endswith(sentence)
+    else:
+        assert (done.returncode, picture.exists()) == (0, True)
+
+
 @pytest.mark.parametrize("command", ["bound", "run"])
 def test_help_does_not_need_the_docstrings_that_python_drops(command: str, call: Called) -> None:
     words = [sys.executable, "-OO", "-m", "hapticbridge", command, "--help-all"]

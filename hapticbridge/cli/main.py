@@ -111,11 +111,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _prepare_output() -> None:
-    """Lets every text be printed, whatever encoding and width the terminal states.
+    """Lets texts be printed and pictures be drawn, whatever terminal the environment states.
 
     Python escapes on stderr what an encoding lacks, such as the µ of a unit, and fails on stdout.
     A width of 0 is that of a terminal whose width is not known; rich would print nothing.
+    Pictures need no window: matplotlib would refuse to be imported for one that it does not know.
     """
+    os.environ["MPLBACKEND"] = "agg"
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
     for name in ("COLUMNS", "LINES"):
