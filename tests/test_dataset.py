@@ -12,6 +12,7 @@ import h5py
 import mujoco
 import numpy as np
 import pytest
+from audit_cases import recorded
 from cli_cases import Called, one_sentence
 from PIL import Image
 
@@ -89,6 +90,25 @@ def test_pictures_show_the_scene_without_arrows(runs: list[Path], tmp_path: Path
     write_dataset(runs[:1], "robomimic", tmp_path / "other", shot)
     with h5py.File(tmp_path / "other" / "demos.hdf5") as file:
         np.testing.assert_array_equal(file["data/demo_0/obs/free_image"][-1], picture)
+
+
+def test_a_camera_of_an_attached_part_has_a_name_that_learners_take(tmp_path: Path) -> None:
+    """LeRobot refuses a feature with '/', and HDF5 makes a group of it."""
+    camera = "<camera name='arm/hand' pos='0 0 1'/>"
+    body = "<body><freejoint/><geom size='.02'/><site name='grip'/></body>"
+    scene = tmp_path / "a.xml"
+    scene.write_text(f"<mujoco><worldbody>{camera}{body}</worldbody></mujoco>")
+    recorded(tmp_path / "run.mcap", scene, duration=0.3)
+    shot = Shot(fps=10, camera="arm/hand", width=32, height=32)
+    folder = write_dataset([tmp_path / "run.mcap"], "lerobot", tmp_path / "set", shot).folder
+    assert len(lerobot(folder, 0)["observation.images.arm_hand"]) == 2
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    assert "observation.images.arm_hand" in info["features"]
+    assert not any("/" in name for name in info["features"])
+    write_dataset([tmp_path / "run.mcap"], "robomimic", tmp_path / "other", shot)
+    with h5py.File(tmp_path / "other" / "demos.hdf5") as file:
+        assert all(isinstance(each, h5py.Dataset) for each in file["data/demo_0/obs"].values())
+        assert file["data/demo_0/obs/arm_hand_image"].shape == (2, 32, 32, 3)
 
 
 def test_lerobot_finds_what_its_description_says(runs: list[Path], tmp_path: Path) -> None:

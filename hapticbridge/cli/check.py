@@ -188,9 +188,10 @@ def print_inventory(inventory: Inventory, contact: str) -> None:
             lines[f"{kind} rows"] = f"at most {largest} in a step, median {median:g}"
     if inventory.stiffness is not None:
         least, most = (f"{float(f'{1e-3 * each:.3g}'):,g}" for each in inventory.stiffness)
+        depth = length(abs(inventory.deepest))
+        sank = f"sank in by {depth}" if inventory.deepest >= 0.0 else f"a margin kept {depth} away"
         lines["contact stiffness"] = (
-            f"{least} to {most} kN/m at the tool, which sank in by {length(inventory.deepest)} "
-            f"({_CONTACTS[contact]})"
+            f"{least} to {most} kN/m at the tool, which {sank} ({_CONTACTS[contact]})"
         )
     if inventory.bounces:
         each = (f"{one.names}, e at most {one.e:.2g}" for one in inventory.bounces)

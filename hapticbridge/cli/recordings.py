@@ -158,7 +158,8 @@ class Export:
     fps: int | None = None
     """Frames per second of a data set, by default 30."""
     camera: str | None = None
-    """Camera of the scene whose pictures a data set holds, or 'free'; by default none."""
+    """Camera of the scene whose pictures a data set holds, or 'free'; by default none. A '/' of its
+    name becomes '_' there."""
     size: tuple[int, int] | None = option(None, metavar="W H")
     """Width and height of the pictures in pixels, both even; by default 320 240."""
     task: str | None = None

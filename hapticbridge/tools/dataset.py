@@ -191,7 +191,7 @@ class LeRobotWriter:
             self._numbers.setdefault(name, []).append(values)
         looked = np.zeros((0, 3))
         if episode.pictures:
-            key = f"observation.images.{self._shot.camera}"
+            key = f"observation.images.{_label(self._shot)}"
             pictures = [
                 {"bytes": data, "path": f"frame-{frame:06d}.png"}
                 for frame, data in enumerate(episode.pictures)
@@ -270,7 +270,7 @@ class LeRobotWriter:
         }
         if episode.pictures:
             shape = [self._shot.height, self._shot.width, 3]
-            features[f"observation.images.{self._shot.camera}"] = {
+            features[f"observation.images.{_label(self._shot)}"] = {
                 "dtype": "image",
                 "shape": shape,
                 "names": ["height", "width", "channels"],
@@ -284,6 +284,14 @@ class LeRobotWriter:
         path = self._folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         self._parquet.write_table(self._arrow.table(dict(columns)), path)
+
+
+def _label(shot: Shot) -> str:
+    """Returns the camera's name without '/'.
+
+    LeRobot refuses a feature with it, and robomimic would meet a group of HDF5 in place of numbers.
+    """
+    return str(shot.camera).replace("/", "_")
 
 
 def _statistics(values: NDArray[Any], count: int) -> dict[str, Any]:
@@ -366,7 +374,7 @@ class RobomimicWriter:
             if name in episode.values
         }
         if episode.pictures:
-            observed[f"{self._shot.camera}_image"] = _frames(episode.pictures)
+            observed[f"{_label(self._shot)}_image"] = _frames(episode.pictures)
         for name, values in observed.items():
             demo[f"obs/{name}"] = values
             demo[f"next_obs/{name}"] = np.concatenate([values[1:], values[-1:]])
