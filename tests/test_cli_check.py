@@ -108,8 +108,9 @@ def test_check_says_where_a_urdf_that_does_not_compile_takes_its_inertia(
 def test_check_draws_a_motion_too_short_to_measure_growth(tmp_path: Path, call: Called) -> None:
     picture, motion = tmp_path / "check.png", tmp_path / "short.csv"
     motion.write_text("t,x,y,z\n0,0,0,0\n0.05,0.001,0,0\n")
-    code, _, err = call("check", "point_mass", "--motion", motion, "--plot", picture)
+    code, out, err = call("check", "point_mass", "--motion", motion, "--plot", picture)
     assert code == 0, err
+    assert f"run point_mass --device simulated:path={motion}" in " ".join(out.split())
     assert picture.exists()
 
 

@@ -347,9 +347,10 @@ class Summary:
         if self.certification.standing is Standing.NO_HAND:
             return "passive: the scene gave out no more energy than it got"
         if self.is_certified:
+            if not method_named(self.method).has_guarantee:
+                return f"passive this time; method {self.method} guarantees no other hand anything"
             more = f", and {format_energy(self.credit)}" if self.credit else ""
-            if self.certification.has_open_steps:
-                more += ", if its friction holds the encoder's steps"
+            more += self.certification.provisos
             more += ", apart from what motors and inputs gave" if self.hand_energy.limit else ""
             return (
                 "passive, and certified: on the device as stated no hand gets more than it puts in "
