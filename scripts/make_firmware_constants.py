@@ -21,6 +21,7 @@ def header() -> str:
         "HB_VERSION": protocol.VERSION,
         "HB_LONGEST_WATCHDOG_MS": protocol.MAX_WATCHDOG_MS,
         **{f"HB_KIND_{kind.name}": int(kind) for kind in protocol.Kind},
+        **{f"HB_CAUSE_{cause.name}": int(cause) for cause in protocol.Cause},
         "HB_OPTION_ENABLE": protocol.ENABLE,
         "HB_OPTION_HAS_VELOCITY": protocol.HAS_VELOCITY,
         "HB_OPTION_IS_PLACED": protocol.IS_PLACED,

@@ -194,6 +194,10 @@ void board_state(HbBoard* board, const float* position, int status, unsigned now
   board->state(motion, now_us, frame);
 }
 
+void board_heat(HbBoard* board, float temperature, float limit) {
+  board->set_temperature(temperature, limit);
+}
+
 void board_tick(HbBoard* board, const float* position, unsigned now_us, float* force) {
   board->tick(position, now_us, force);
 }

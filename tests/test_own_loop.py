@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,16 @@ from emulated.hid_seam import DrivingClock, HidSeam
 from firmware_build import COMPILER
 
 import hapticbridge as hb
+from hapticbridge.cli.guide import page
+from hapticbridge.demand.guard import FADE
 from hapticbridge.demand.own_loop import REPORT_DTYPE, ROUNDING, OwnLoopTally
 from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.own_loop import BoardSetting, LoopReport, LoopState, ShownTool
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
 from hapticbridge.device.simulated.device import hand_for
-from hapticbridge.errors import DeviceError
+from hapticbridge.device.watchdog import watchdog_time
+from hapticbridge.errors import DeviceError, SafetyTrip
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.run.commands import Couple, Reset, Switch
 from hapticbridge.run.own_loop import OwnLoop
@@ -257,6 +261,27 @@ def test_what_a_board_cannot_have_is_left_to_the_bridge(library: ctypes.CDLL) ->
     refused = Bench(library, "point_mass")
     with refused.bridge(method="weld", i_know=True) as bridge:
         assert not bridge.setup.info.loop_period
+
+
+def test_a_silent_host_lets_the_force_go_in_the_time_that_the_guide_says(
+    library: ctypes.CDLL,
+) -> None:
+    bench, forces = Bench(library), []
+
+    def cut(tick: int) -> None:
+        bench.board.is_cut = tick >= 800
+        forces.append(float(np.linalg.norm(bench.board.force)))
+
+    with bench.bridge() as bridge:
+        bridge.run(0.86, cut)
+    after = forces[800:]
+    silence, fade = 1e3 * watchdog_time(1e-3), 1e3 * FADE
+    end = round(silence + fade)
+    assert after[round(silence) - 2] > 0.9 * after[0] > 1.0
+    assert after[end - 4] > 0.0
+    assert after[end + 2] == 0.0
+    words = f"at least {silence:g} ms | the force fades in another {fade:g} ms: at 1 kHz it is zero"
+    assert f"{words} {end} ms after the last pose" in page("stiff-device")
 
 
 class Jerky:
@@ -515,3 +540,53 @@ def test_a_certificate_with_unknown_friction_says_so_in_its_first_line(
         summary = bridge.run(0.5)
     assert summary.is_certified
     assert summary.headline.endswith(", if its friction holds the encoder's steps")
+
+
+@pytest.mark.parametrize("limit", [80.0, 90.0, float("nan")])
+def test_the_motors_temperature_is_reported_and_warned_of_near_its_limit(
+    library: ctypes.CDLL, tmp_path: Path, limit: float
+) -> None:
+    bench, path = Bench(library), tmp_path / "run.mcap"
+    with warnings.catch_warnings(record=True) as said, bench.bridge(recording=path) as bridge:
+        warnings.simplefilter("always")
+        bench.board.heat(72.4, limit)
+        bridge.run(0.2)
+        bench.board.heat(71.0, limit)
+        summary = bridge.run(0.2)
+    own = summary.certification.own_loop
+    assert own is not None
+    assert own.temperature == pytest.approx(72.4)
+    assert "its motors reached 72 °C" in str(summary)
+    assert ("are switched off at" in str(summary)) is not np.isnan(limit)
+    sentence = "board: its motors reached 72 °C, and are switched off at 80 °C; let them rest"
+    assert [str(each.message) for each in said] == [sentence] * (limit == 80.0)
+    audited = hb.audit(path, in_process=True).certification
+    assert audited is not None
+    assert audited.own_loop == own
+
+
+def test_a_board_without_a_thermometer_says_nothing_of_temperature(library: ctypes.CDLL) -> None:
+    with Bench(library).bridge() as bridge:
+        summary = bridge.run(0.2)
+    assert "°C" not in str(summary)
+
+
+FAULTS = {
+    8: "a fault of its own (status 0x09) and gives no force; restart and home it",
+    8 + 64: "that a motor or its driver is too hot (status 0x49) and gives no force; let it cool",
+    8 + 128: "that an encoder is not read (status 0x89) and gives no force; check its cable",
+    8 + 192: "that a motor's driver has switched off (status 0xc9) and gives no force; check",
+}
+
+
+@pytest.mark.parametrize("status", FAULTS)
+def test_a_fault_is_said_by_its_name(library: ctypes.CDLL, status: int) -> None:
+    bench = Bench(library)
+
+    def fail(tick: int) -> None:
+        bench.board.status = status * (tick > 100)
+
+    with pytest.raises(SafetyTrip) as trip, bench.bridge() as bridge:
+        bridge.run(0.2, fail)
+    assert FAULTS[status] in str(trip.value)
+    assert np.linalg.norm(bench.board.force) == 0.0

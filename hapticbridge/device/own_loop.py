@@ -69,7 +69,8 @@ class LoopReport(NamedTuple):
         ticks: Periods so far.
         missed: Periods that the timer has missed.
         share: Share of the gains in force, 0 to 1.
-        temperature: Temperature of the motors in °C; NaN if unknown.
+        temperature: Temperature of the motors in °C; None if unknown.
+        temperature_limit: Temperature in °C at which they are switched off; None if unknown.
         tool: Position of the shown tool in m.
     """
 
@@ -80,7 +81,8 @@ class LoopReport(NamedTuple):
     ticks: int
     missed: int
     share: float
-    temperature: float
+    temperature: float | None
+    temperature_limit: float | None
     tool: tuple[float, ...]
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.demand.own_loop import COUNTERS, REPORT_DTYPE, OwnLoopTally
+from hapticbridge.demand.own_loop import COUNTERS, REPORT_DTYPE, TEMPERATURES, OwnLoopTally
 from hapticbridge.device.own_loop import (
     SURFACES,
     BoardSetting,
@@ -162,6 +162,8 @@ class OwnLoop:
             return None
         reports, self._reports = np.array(self._reports, REPORT_DTYPE), []
         counters = self._device.loop_report
-        told = {} if counters is None else {name: getattr(counters, name) for name in COUNTERS}
+        numbers = {} if counters is None else counters._asdict()
+        known = (*COUNTERS, *TEMPERATURES)
+        told = {name: numbers[name] for name in known if numbers.get(name) is not None}
         self.tally.add(reports, told)
         return {"reports": base64.b64encode(reports.tobytes()).decode(), **told}

@@ -83,6 +83,11 @@ class LoopBoard(HidDevice):
         self.status = self.skip_every = 0
         self.has_counters, self.is_cut = True, False
 
+    def heat(self, temperature: float, limit: float) -> None:
+        """Sets the temperature of the motors and its limit in °C."""
+        numbers = ctypes.c_float(temperature), ctypes.c_float(limit)
+        self._library.board_heat(self._board, *numbers)
+
     def advance(self, now: float) -> None:
         if self._start is None:
             self._start = now

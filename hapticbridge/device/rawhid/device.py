@@ -29,6 +29,7 @@ from hapticbridge.device.rawhid.protocol import (
     NAME_PAGE,
     NUMBERS_PAGE,
     VERSION,
+    Cause,
     GripNumbers,
     Numbers,
     State,
@@ -272,6 +273,13 @@ FIRST_STATE_MS = 1000
 
 NO_WRENCH = (0.0,) * 6
 
+_FAULTS: dict[int, tuple[str, str]] = {
+    Cause.TEMPERATURE: ("that a motor or its driver is too hot", "let it cool, and home it"),
+    Cause.ENCODER: ("that an encoder is not read", "check its cable, and home it"),
+    Cause.DRIVER: ("that a motor's driver has switched off", "check its supply, and home it"),
+}
+"""Faults by their cause, each with a remedy."""
+
 
 class RawHidDevice:
     """A device that streams its state and applies the newest force frame.
@@ -469,10 +477,14 @@ class RawHidDevice:
 
     def _refuse_fault(self, state: State | LoopState) -> None:
         if state.status & (Status.FAULT | Status.NOT_READY):
-            what = "a fault of its own" if state.status & Status.FAULT else "that its pose was lost"
+            what, remedy = "that its pose was lost", "restart and home it"
+            if state.status & Status.FAULT:
+                what, remedy = _FAULTS.get(
+                    state.status & Status.CAUSE, ("a fault of its own", remedy)
+                )
             raise DeviceError(
                 f"{self._name} reports {what} (status 0x{state.status:02x}) and gives no force; "
-                "restart and home it"
+                f"{remedy}"
             )
 
     def _fill(self, state: State | LoopState) -> None:

@@ -69,6 +69,7 @@ class Status(IntFlag):
         FAULT: The device has detected a fault (encoder, driver, temperature) and gives no force.
         NOT_READY: The pose is not valid yet: the device must be homed or calibrated first.
         DAMAGED: A frame with a wrong CRC has come since the newest valid one.
+        CAUSE: Cause of the fault (``Cause``); 0 if it is not reported.
     """
 
     ENABLED = 1
@@ -77,6 +78,21 @@ class Status(IntFlag):
     FAULT = 8
     NOT_READY = 16
     DAMAGED = 32
+    CAUSE = 192
+
+
+class Cause(IntEnum):
+    """Cause of a fault, the bits ``Status.CAUSE``.
+
+    Attributes:
+        TEMPERATURE: A motor or its driver is too hot.
+        ENCODER: An encoder is not read.
+        DRIVER: A motor's driver has switched off.
+    """
+
+    TEMPERATURE = 64
+    ENCODER = 128
+    DRIVER = 192
 
 
 ENABLE = 1
@@ -95,7 +111,7 @@ _GRIP = struct.Struct("<BBBBHH7f26x")
 _NUMBERS = struct.Struct("<BBBBHH13f2x")
 _NAME = struct.Struct("<BBBBHH54s")
 _LOOP = struct.Struct("<BBBBHHI9fqfH")
-_REPORT = struct.Struct("<BBBBHH2q3I5f6x")
+_REPORT = struct.Struct("<BBBBHH2q3I6f2x")
 _SETTING = struct.Struct("<BBBBHH5fq26x")
 _SHOW = struct.Struct("<BBBBHH6fq4f6x")
 _PLANES = struct.Struct("<BBBBHH8f22x")
@@ -312,7 +328,7 @@ def decoded(frame: bytes) -> Answer | None:
             echo=echo,
         )
     if kind == Kind.REPORT:
-        sequence, _, changes, work, held_back, ticks, missed, share, heat, *tool = (
+        sequence, _, changes, work, held_back, ticks, missed, share, heat, *tool, limit = (
             _REPORT.unpack_from(frame)[4:]
         )
         return LoopReport(
@@ -323,7 +339,8 @@ def decoded(frame: bytes) -> Answer | None:
             ticks,
             missed,
             share,
-            temperature=heat,
+            temperature=heat if math.isfinite(heat) else None,
+            temperature_limit=limit if math.isfinite(limit) and limit > 0.0 else None,
             tool=tuple(tool),
         )
     return _page(frame) if kind == Kind.SHEET else None

@@ -43,7 +43,7 @@ class HbBoard {
         is_unfit_(false),
         frames_(0) {
     memset(&pace_, 0, sizeof pace_);
-    pace_.temperature = NAN;
+    set_temperature(NAN, NAN);
   }
 
   // Decodes one report from the host, as HbDevice does, and gives its order to the loop.
@@ -105,8 +105,12 @@ class HbBoard {
     HB_UNLOCK();
   }
 
-  // Temperature of the motors in degrees Celsius, for the host.
-  void set_temperature(float temperature) { pace_.temperature = temperature; }
+  // Sets the temperature of the motors in degrees Celsius, and the one at which the sketch sets
+  // HB_FAULT_TEMPERATURE, for the host.
+  void set_temperature(float temperature, float limit) {
+    pace_.temperature = temperature;
+    pace_.temperature_limit = limit;
+  }
 
  private:
   static HbSheet with_rate(HbSheet sheet, float period) {

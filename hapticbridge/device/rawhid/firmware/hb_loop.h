@@ -103,9 +103,10 @@ struct HbReport {
 
 // How well the timer keeps the period.
 struct HbPace {
-  uint32_t ticks;     // periods so far
-  uint32_t missed;    // of them, those that came a period late or more
-  float temperature;  // degrees Celsius of the motors; NAN if unknown
+  uint32_t ticks;           // periods so far
+  uint32_t missed;          // of them, those that came a period late or more
+  float temperature;        // degrees Celsius of the motors; NAN if unknown
+  float temperature_limit;  // at which they are switched off; NAN if unknown
 };
 
 class HbLoop {

@@ -261,7 +261,7 @@ void HbDevice::begin_state(uint8_t kind, const HbMotion& motion, uint32_t now_us
                            uint8_t frame[HB_FRAME_BYTES]) {
   command_.is_unfit = (motion.status & (HB_FAULT | HB_NOT_READY)) != 0;
   wrench(now_us);  // updates command_.has_expired
-  uint8_t status = motion.status & (HB_SATURATED | HB_FAULT | HB_NOT_READY);
+  uint8_t status = motion.status & (HB_SATURATED | HB_FAULT_DRIVER | HB_NOT_READY);
   if (!is_loop_ && command_.is_enabled) status |= HB_ENABLED;
   if (!is_loop_ && command_.has_expired) status |= HB_WATCHDOG;
   if (is_damaged_) status |= HB_DAMAGED;
@@ -300,6 +300,7 @@ void HbDevice::loop_report(const HbReport& report, const HbPace& pace,
   put_float(frame + 36, report.share);
   put_float(frame + 40, pace.temperature);
   for (int i = 0; i < 3; i++) put_float(frame + 44 + 4 * i, report.tool[i]);
+  put_float(frame + 56, pace.temperature_limit);
   seal(frame);
 }
 

@@ -34,7 +34,11 @@ enum HbStatus {
   HB_SATURATED = 4,   // the motors could not apply the whole wrench
   HB_FAULT = 8,       // encoder, driver or temperature: the device gives no force
   HB_NOT_READY = 16,  // the pose is not valid yet
-  HB_DAMAGED = 32     // a frame with a wrong CRC has come since the newest valid one
+  HB_DAMAGED = 32,    // a frame with a wrong CRC has come since the newest valid one
+  // in the place of HB_FAULT, where its cause is known
+  HB_FAULT_TEMPERATURE = HB_FAULT | HB_CAUSE_TEMPERATURE,  // a motor or its driver is too hot
+  HB_FAULT_ENCODER = HB_FAULT | HB_CAUSE_ENCODER,          // an encoder is not read
+  HB_FAULT_DRIVER = HB_FAULT | HB_CAUSE_DRIVER             // a motor's driver has switched off
 };
 
 // Data sheet of a grip axis; NAN for unknown numbers. The limits must be known.

@@ -127,6 +127,11 @@ class HbSketchBoard {
   // Runs what is due in loop().
   void poll() {}
 
+  // Sets the temperature of the motors and its limit in degrees Celsius, see HbBoard.
+  void set_temperature(float temperature, float limit) {
+    board_.set_temperature(temperature, limit);
+  }
+
   // Runs one period, in the timer's interrupt. It renders without loop(): if that hangs, no frame
   // is received, and the patience or the watchdog of the last one ends the force here. A processor
   // that has stopped keeps its PWM: drive an enable input of the driver by a hardware watchdog.
