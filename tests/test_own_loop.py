@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 from board_attack import built_loop
+from cli_cases import Called, facts_of
 from emulated.board_model import BoardSheet, LoopBoard
 from emulated.hid_seam import DrivingClock, HidSeam
 from firmware_build import COMPILER
 
 import hapticbridge as hb
 from hapticbridge.cli.guide import page
+from hapticbridge.demand.certificate import conditions_of
 from hapticbridge.demand.guard import FADE
 from hapticbridge.demand.own_loop import REPORT_DTYPE, ROUNDING, OwnLoopTally
 from hapticbridge.device import Motion, SimulatedDevice
@@ -282,6 +284,50 @@ def test_a_silent_host_lets_the_force_go_in_the_time_that_the_guide_says(
     assert after[end + 2] == 0.0
     words = f"at least {silence:g} ms | the force fades in another {fade:g} ms: at 1 kHz it is zero"
     assert f"{words} {end} ms after the last pose" in page("stiff-device")
+
+
+@pytest.mark.parametrize("loop_delay", [1e-5, 1.5e-4])
+@pytest.mark.parametrize("stiffness", [1e3, 15e3, 60e3])
+def test_bound_states_the_condition_of_a_run(
+    library: ctypes.CDLL, call: Called, stiffness: float, loop_delay: float
+) -> None:
+    bench = Bench(library, sheet=BoardSheet(loop_delay=loop_delay))
+    coupling = {"stiffness": stiffness, "damping": 3.0}
+    with bench.bridge(coupling) as bridge:
+        (condition,) = conditions_of(bridge.setup.loop)
+        assert bridge.conditions() == (condition.sentence(),)
+    own = f"--loop-rate 1e4 --loop-delay {loop_delay}"
+    device = "simulated:damping=2,friction=0.1,resolution=1e-5"
+    judged = f"bound --stiffness {stiffness} --damping 3 {own} --device {device}"
+    code, out, err = call(*judged.split())
+    assert condition.sentence() in out.replace("\n", " ")
+    assert (code, err) == (int(not condition.holds), "")
+    assert "in its own loop" in out
+
+
+JUDGED = "bound --stiffness 15000 --loop-rate 1e4 --loop-delay 1e-5"
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (f"{JUDGED} --device-damping 2 --plot x.png", "for a loop on the computer"),
+        (JUDGED, "--loop-rate goes with --device or --device-damping"),
+        ("bound --stiffness 1 --loop-rate 1e4 --device-damping 2", "needs --loop-delay"),
+        ("bound --stiffness 1 --loop-delay 1e-5 --device-damping 2", "has no effect"),
+        ("run point_mass --device simulated:loop_rate=1e4", "'hapticbridge bound --loop-rate HZ"),
+    ],
+)
+def test_a_loop_that_cannot_be_judged_is_refused(call: Called, command: str, message: str) -> None:
+    code, out, err = call(*command.split())
+    assert (code, out, message in err.replace("\n", " ")) == (2, "", True)
+
+
+def test_bound_judges_a_board_that_is_not_built(call: Called) -> None:
+    for damping, is_enough in ((1.0, True), (0.9, False)):
+        code, facts = facts_of(call, *JUDGED.split(), "--device-damping", damping)
+        # K (T_b/2 + 1.5 t)
+        assert (code, facts["needed"]) == (int(not is_enough), pytest.approx(0.975, rel=1e-3))
 
 
 class Jerky:
