@@ -31,6 +31,7 @@ def header() -> str:
     }
     reals = {"HB_NEAR": shown_tool.NEAR, "HB_SLOWEST": shown_tool.SLOWEST}
     reals["HB_LONGEST"] = shown_tool.LONGEST
+    reals |= {"HB_SPEED_STEP": protocol.SPEED_STEP, "HB_TURN_STEP": protocol.TURN_STEP}
     lines = [f"static const int {name} = {value};" for name, value in numbers.items()]
     lines += [f"static const float {name} = {value!r}f;" for name, value in reals.items()]
     return "\n".join(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import warnings
 from dataclasses import replace
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from board_attack import built_loop
 from cli_cases import Called, facts_of
-from emulated.board_model import BoardSheet, LoopBoard
+from emulated.board_model import POSE, BoardSheet, LoopBoard
 from emulated.hid_seam import DrivingClock, HidSeam
 from firmware_build import COMPILER
 
@@ -28,6 +29,7 @@ from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
 from hapticbridge.device.simulated.device import hand_for
 from hapticbridge.device.watchdog import watchdog_time
 from hapticbridge.errors import DeviceError, SafetyTrip
+from hapticbridge.kernel.pose import product, quaternion_exp, rotation_between
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.run.commands import Couple, Reset, Switch
 from hapticbridge.run.own_loop import OwnLoop
@@ -51,13 +53,20 @@ class Bench:
         scene: str = "virtual_wall",
         sheet: BoardSheet | None = None,
         link: float = 0.5e-3,
+        path: str | Motion | None = None,
         **options: object,
     ) -> None:
         self.scene, own = hb.load_scene(scene), sheet or BoardSheet()
         hand = hand_for(self.scene)
         friction = 0.1 if np.isnan(own.friction) else own.friction
         mechanics = SimulatedDevice(
-            hand=hand, mass=own.mass, damping=own.damping, friction=friction
+            hand=hand,
+            mass=own.mass,
+            damping=own.damping,
+            friction=friction,
+            rotational_inertia=own.rotational_inertia,
+            rotational_damping=own.rotational_damping,
+            path=path,
         )
         self.mechanics, self.board = mechanics, LoopBoard(library, mechanics, own, link)
         self.seam = HidSeam(self.board)
@@ -147,6 +156,8 @@ def test_a_scene_may_be_scaled_turned_and_slow(library: ctypes.CDLL, tmp_path: P
     assert hb.audit(path, in_process=True).verdict == "passive"
 
 
+SIX_AXES = BoardSheet(axes=0b111111 | POSE, friction=0.0, resolution=0.0)
+
 KNOB = """<mujoco><worldbody><body><joint type="hinge" axis="0 0 1" range="-20 20" limited="true"/>
 <geom type="cylinder" size=".03 .01" mass=".1"/><site name="grip"/></body></worldbody></mujoco>"""
 
@@ -159,18 +170,13 @@ def test_a_knob_feels_the_stop_of_a_hinge(library: ctypes.CDLL, tmp_path: Path) 
     table = np.column_stack(
         [times, np.zeros((301, 3)), np.cos(half), np.zeros((301, 2)), np.sin(half)]
     )
-    sheet = BoardSheet(axes=0b100000, damping=1e-3, friction=0.0, resolution=0.0, force_limit=0.05)
-    mechanics = SimulatedDevice(
-        rotational_inertia=1e-5,
-        rotational_damping=1e-3,
-        path=Motion(times, table[:, 1:4], table[:, 4:]),
+    sheet = replace(
+        SIX_AXES, axes=0b100000, rotational_damping=1e-3, rotational_inertia=1e-5, torque_limit=0.05
     )
-    board = LoopBoard(library, mechanics, sheet, 0.5e-3)
-    seam, path = HidSeam(board), tmp_path / "run.mcap"
-    device = open_rawhid({}, ignore_message, seam, lambda: seam.now)
-    assert (device.info.axes, device.info.loop_period) == (("rz",), 1e-4)
-    clock = DrivingClock(seam)
-    with hb.Bridge(tmp_path / "knob.xml", device, clock=clock, recording=path) as bridge:
+    motion, path = Motion(times, table[:, 1:4], table[:, 4:]), tmp_path / "run.mcap"
+    bench = Bench(library, str(tmp_path / "knob.xml"), sheet, path=motion)
+    assert (bench.device.info.axes, bench.device.info.loop_period) == (("rz",), 1e-4)
+    with bench.bridge(recording=path) as bridge:
         summary = bridge.run(1.6)
         ticks = bridge.latest_records(800)
     stiffness = bridge.setup.law.rotational_stiffness
@@ -178,8 +184,115 @@ def test_a_knob_feels_the_stop_of_a_hinge(library: ctypes.CDLL, tmp_path: Path) 
     deepest = ticks[np.argmax(np.abs(ticks["wrench_on_device"][:, 5]))]
     assert -deepest["wrench_on_device"][5] == pytest.approx(0.05, rel=1e-3)
     assert summary.is_certified
-    assert board.work - board.burned < ROUNDING
+    assert bench.gained < ROUNDING
     assert hb.audit(path, in_process=True).verdict == "passive"
+
+
+@pytest.mark.parametrize("scene", ["peg_in_hole", "screwdriver", "hex_key"])
+@pytest.mark.parametrize("link", [0.0, 5e-3])
+def test_a_six_axis_board_gives_no_hand_energy(
+    library: ctypes.CDLL, tmp_path: Path, scene: str, link: float
+) -> None:
+    bench, path = Bench(library, scene, SIX_AXES, link), tmp_path / "run.mcap"
+    with bench.bridge(recording=path) as bridge:
+        summary = bridge.run(1.5)
+    law = bridge.setup.law
+    assert law.rotational_stiffness > 10.0
+    assert law.rotational_damping == 0.0
+    assert summary.is_certified
+    assert [each.axis for each in summary.certification.conditions] == ["translation", "rotation"]
+    assert summary.peak_torque > 2e-3
+    assert bench.gained < ROUNDING
+    report = hb.audit(path, in_process=True)
+    assert (report.verdict, report.agreement) == ("passive", "bit for bit")
+
+
+def test_the_boards_torque_bears_what_the_hosts_does_not(library: ctypes.CDLL) -> None:
+    """The same six-axis device behind 2 ms, at the same rotational stiffness."""
+    stiff = {"rotational_stiffness": 20.0, "rotational_damping": 0.0}
+    board = Bench(library, "hex_key", SIX_AXES, 1e-3)
+    with board.bridge(stiff) as bridge:
+        summary = bridge.run(2.0)
+    assert summary.is_certified
+    assert board.gained < ROUNDING
+    host = Bench(library, "hex_key", SIX_AXES, 1e-3, loop_rate=0.0)
+    assert host.device.info.loop_period is None
+    with host.bridge() as bridge:
+        assert bridge.run(0.5).is_certified
+        assert bridge.setup.law.rotational_stiffness < 2.0
+    assert host.gained < ROUNDING
+    swinging = Bench(library, "hex_key", SIX_AXES, 1e-3, loop_rate=0.0)
+    with contextlib.suppress(SafetyTrip), swinging.bridge(stiff) as bridge:
+        bridge.run(2.0)
+    assert bridge.summary().is_certified is False
+    assert swinging.gained > 100.0 * ROUNDING
+
+
+def test_rotations_of_a_turned_and_scaled_scene_are_shown_as_they_are(
+    library: ctypes.CDLL, tmp_path: Path
+) -> None:
+    """The board is shown the tool's rotation in the device's frame; angles are not scaled."""
+    turned = hb.Workspace(scale=2.0, axes=((0, 1, 0), (0, 0, 1), (1, 0, 0)))
+    path, times = tmp_path / "run.mcap", np.linspace(0.0, 1.5, 151)
+    half = 0.2 * np.sin(np.pi * np.clip(times - 0.5, 0.0, 1.0))  # after the rise of the force
+    away = np.column_stack([np.cos(half), np.zeros((151, 2)), np.sin(half)])
+    motion = Motion(times, np.zeros((151, 3)), away)
+    bench = Bench(library, "peg_in_hole", SIX_AXES, path=motion)
+    found: list[tuple[Any, Any]] = []
+    show = bench.device.show
+
+    def note(shown: ShownTool) -> int:
+        if rows := len(bridge.latest_records(1)):
+            found.append((shown.rotation, bridge.latest_records(rows)["tool_quaternion"][0].copy()))
+        return show(shown)
+
+    bench.device.show = note  # type: ignore[method-assign]
+    with bench.bridge(workspace=turned, recording=path) as bridge:
+        summary = bridge.run(1.4)
+        parameters = bridge.session.parameters
+    axes = np.array(parameters.axes).reshape(3, 3)
+    w, *begin = parameters.handle_origin[3:]
+    angles = []
+    for rotation, tool in found:
+        x, y, z = (axes @ np.array(rotation)).tolist()
+        mapped = product(quaternion_exp((x, y, z)), (w, begin[0], begin[1], begin[2]))
+        angles.append(np.linalg.norm(rotation_between(tuple(tool), mapped)))
+    assert max(np.linalg.norm(rotation) for rotation, _ in found) > 0.3
+    assert max(angles) < 0.03
+    assert summary.is_certified
+    assert bench.gained < ROUNDING
+    assert hb.audit(path, in_process=True).verdict == "passive"
+
+
+def test_a_boards_rotation_that_it_does_not_render_stays_with_the_bridge(
+    library: ctypes.CDLL,
+) -> None:
+    """A board from before, and a handle about two axes; one about one axis beside lines has it."""
+    for axes, has_own in (
+        (0b111111, False),
+        (0b011111 | POSE, False),
+        (0b100111 | POSE, True),
+        (0b111000 | POSE, True),
+    ):
+        bench = Bench(library, "point_mass", replace(SIX_AXES, axes=axes))
+        assert (bench.device.info.loop_period is not None) is has_own
+        with bench.bridge() as bridge:
+            summary = bridge.run(0.4)
+        assert summary.is_certified
+        assert bench.gained < ROUNDING
+
+
+def test_states_without_their_rotation_are_lost(library: ctypes.CDLL) -> None:
+    bench = Bench(library, "peg_in_hole", SIX_AXES)
+
+    def lose(tick: int) -> None:
+        bench.board.loses_turns = 200 <= tick < 220
+
+    with bench.bridge() as bridge:
+        summary = bridge.run(0.4, lose)
+    assert 18 <= bench.device.states.lost <= 21
+    assert summary.is_certified
+    assert bench.gained < ROUNDING
 
 
 def test_a_recorded_run_repeats_to_the_bit_with_commands(
@@ -337,7 +450,7 @@ class Jerky:
         name="jerky", axes=("x",), force_limit=10.0, damping=2.0, delay=0.0, loop_period=1e-4
     )  # fmt: skip
     loop_report: LoopReport | None = None
-    place = (0.0, 0.0, 0.0)
+    place, is_posed = (0.0, 0.0, 0.0), False
 
     def __init__(self) -> None:
         self.info = replace(self.info, is_real=False)
@@ -447,7 +560,7 @@ def test_a_run_ends_what_an_earlier_program_has_left(
 class Answering:
     """A device that is shown tools, and answers the newest alone."""
 
-    place, loop_report = (0.0, 0.0, 0.0), None
+    place, loop_report, is_posed = (0.0, 0.0, 0.0), None, False
 
     def __init__(self, info: hb.DeviceInfo) -> None:
         self.info, self.loop_state = info, loop_state(0, 0.0)

@@ -15,6 +15,10 @@ from emulated.rawhid_model import RawHid
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.own_loop import LoopReport
 from hapticbridge.device.rawhid.protocol import decoded
+from hapticbridge.kernel.pose import quaternion_log, rotation_between
+
+POSE = 0b10000000
+"""Axis bit of a board whose loop renders lines and rotations."""
 
 STATE_PERIOD = 1.01e-3
 """Time in s between two state frames: a little more than a full-speed host polls in."""
@@ -24,7 +28,7 @@ STATE_PERIOD = 1.01e-3
 class BoardSheet:
     """Data sheet of a board: axes as bits, and numbers in SI units."""
 
-    axes: int = 0b111  # beyond 0b111 damping, friction, step and limit are those of rotation
+    axes: int = 0b111
     period: float = 1e-4
     damping: float = 2.0
     friction: float = 0.1
@@ -33,6 +37,9 @@ class BoardSheet:
     speed_limit: float = 5.0
     mass: float = 0.1
     loop_delay: float = 1e-5
+    rotational_damping: float = 2e-3
+    rotational_inertia: float = 1e-4
+    torque_limit: float = 0.3
 
 
 class LoopBoard(HidDevice):
@@ -45,12 +52,14 @@ class LoopBoard(HidDevice):
         link: Further delay of the link in s, in each direction.
 
     Attributes:
-        force: Force on the handle in N, (3,).
+        force: Force on the handle in N, or torque in N m of a device that only turns, (3,).
+        torque: Torque on the handle in N m, where a loop renders lines and rotations, (3,).
         work: Energy in J that the motors have given the handle.
         burned: Energy in J that the stated damping has burned meanwhile.
         skip_every: Number of periods of which one is missed; 0 for none.
         has_counters: False for a board that never sends the counters of its loop.
         is_cut: True while nothing from the host arrives.
+        loses_turns: True while the second frame of a state is lost.
     """
 
     vendor, product, serial = RawHid.vendor, RawHid.product, "7"
@@ -67,21 +76,24 @@ class LoopBoard(HidDevice):
         super().__init__()
         self.sheet, self._library, self._link = sheet or BoardSheet(), library, link
         own = self.sheet
-        self._turns = own.axes & 0b111 == 0
+        self._is_posed = bool(own.axes & POSE)
+        self._is_knob = own.axes & 0b111 == 0 and not self._is_posed
         numbers = [own.damping, own.friction, own.resolution]
         numbers += [own.force_limit, own.speed_limit, own.mass, own.loop_delay]
+        numbers += [own.rotational_damping, own.rotational_inertia, own.torque_limit]
         new = library.board_new(own.axes, ctypes.c_float(own.period), floats(numbers))
         self._board = ctypes.c_void_p(new)
         self._mechanics, self._sample = mechanics, mechanics.start(own.period)
         mechanics.read(self._sample)
-        self.force, self._sent = np.zeros(3, np.float32), np.zeros(6)
+        self._wrench, self._sent = np.zeros(6, np.float32), np.zeros(6)
+        self.force, self.torque = self._wrench[:3], self._wrench[3:]
         self._start: float | None = None
         self._ticks, self._states = 0, 0
         self._to_host: deque[tuple[float, bytes]] = deque()
         self._to_board: deque[tuple[float, bytes]] = deque()
         self.work = self.burned = 0.0
         self.status = self.skip_every = 0
-        self.has_counters, self.is_cut = True, False
+        self.has_counters, self.is_cut, self.loses_turns = True, False, False
 
     def heat(self, temperature: float, limit: float) -> None:
         """Sets the temperature of the motors and its limit in °C."""
@@ -101,6 +113,8 @@ class LoopBoard(HidDevice):
                 state = self._state(due)
                 if self.has_counters or not isinstance(decoded(state), LoopReport):
                     self._to_host.append((due + self._link, state))
+                    if self._is_posed:
+                        self._send_more(due)
             frame = ctypes.create_string_buffer(64)
             if self._library.board_answer(self._board, frame):
                 self._to_host.append((due + self._link, frame.raw))
@@ -115,35 +129,43 @@ class LoopBoard(HidDevice):
             self._to_board.append((now + self._link, report))
 
     def _read(self) -> NDArray[np.float32]:
-        position, step = self._place(), self.sheet.resolution
-        read = step * np.round(position / step) if step else position
-        return np.asarray(read, np.float32)
-
-    def _place(self) -> NDArray[np.float64]:
-        """Returns the position in m, or the rotation vector in rad of a device that only turns."""
-        if not self._turns:
-            return np.array(self._sample["position"][0])
-        w, *axis = self._sample["quaternion"][0]
-        size = float(np.linalg.norm(axis))
-        return np.array(axis) * (2.0 * np.arctan2(size, w) / size if size else 2.0)
+        """Returns position and quaternion as the encoders give them; of a knob its angle."""
+        pose, step = self._sample[0], self.sheet.resolution
+        place = _turn_of(pose["quaternion"]) if self._is_knob else pose["position"]
+        read = step * np.round(place / step) if step else place
+        return np.concatenate([read, pose["quaternion"]]).astype(np.float32)
 
     def _tick(self, due: float) -> None:
-        before = self._place()
+        own, before = self.sheet, self._sample[0].copy()
         if not self.skip_every or self._ticks % self.skip_every:
-            own = self._board, floats(self._read()), _us(due), floats(self.force)
-            self._library.board_tick(*own)
-        self._sent[3 * self._turns : 3 + 3 * self._turns] = self.force
+            numbers = floats(self._read()), _us(due), floats(self._wrench)
+            self._library.board_tick(self._board, *numbers)
+        self._sent[:] = np.roll(self._wrench, 3) if self._is_knob else self._wrench
         self._mechanics.write(self._sent)
         self._mechanics.read(self._sample)
-        moved = self._place() - before
-        self.work += float(self.force @ moved)
-        self.burned += self.sheet.damping / self.sheet.period * float(moved @ moved)
+        moved = self._sample["position"][0] - before["position"]
+        last, now = (tuple(each["quaternion"].tolist()) for each in (before, self._sample[0]))
+        turned = np.array(rotation_between(last, now))
+        self.work += float(self._sent @ np.concatenate([moved, turned]))
+        self.burned += own.rotational_damping / own.period * float(turned @ turned)
+        if own.axes & 0b111:
+            self.burned += own.damping / own.period * float(moved @ moved)
+
+    def _send_more(self, due: float) -> None:
+        frame = ctypes.create_string_buffer(64)
+        if self._library.board_more(self._board, frame) and not self.loses_turns:
+            self._to_host.append((due + self._link, frame.raw))
 
     def _state(self, due: float) -> bytes:
         frame = ctypes.create_string_buffer(64)
         own = self._board, floats(self._read()), self.status, _us(due), frame
         self._library.board_state(*own)
         return frame.raw
+
+
+def _turn_of(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    w, x, y, z = quaternion.tolist()
+    return np.array(quaternion_log((w, x, y, z)))
 
 
 def _us(time: float) -> int:
