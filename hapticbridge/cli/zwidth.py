@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -339,21 +340,9 @@ class Bound:
         if condition is not None:
             holds = condition.holds
         if self.as_json:
-            print_json(
-                {
-                    "needed": ways[0].needed if condition is None else condition.needed,
-                    "frequency_hz": _hertz(ways[0]),
-                    "holds": holds,
-                    "method": default_method().name,
-                    "coupling": asdict(shown),
-                    "largest_stiffness": self._largest_stiffness(b, period),
-                    "device": None if info is None else _device_facts(info, condition),
-                    "alternatives": [
-                        {"name": way.name, "needed": way.needed, "frequency_hz": _hertz(way)}
-                        for way in ways
-                    ],
-                }
-            )
+            facts = _facts(shown, ways, condition, info)
+            largest = self._largest_stiffness(b, period)
+            print_json(facts | {"holds": holds, "largest_stiffness": largest})
         else:
             self._print(ways, shown, period, b, info, condition)
             if condition is not None and (b is None or condition.steps is not None):
@@ -374,18 +363,8 @@ class Bound:
         shown = shown.felt_at("", 1.0, 1.0, is_apart=True)
         condition = _condition(info, coupling, period)
         if self.as_json:
-            print_json(
-                {
-                    "needed": condition.needed,
-                    "frequency_hz": None,
-                    "holds": condition.holds,
-                    "method": default_method().name,
-                    "coupling": asdict(shown),
-                    "largest_stiffness": None,
-                    "device": _device_facts(info, condition),
-                    "alternatives": [],
-                }
-            )
+            facts = _facts(shown, (), condition, info)
+            print_json(facts | {"holds": condition.holds, "largest_stiffness": None})
         else:
             (sentence,) = shown.sentences()
             out.print(sentence)
@@ -537,6 +516,25 @@ def _condition(info: DeviceInfo, coupling: Coupling, period: float) -> DampingCo
 def _is_prompt(info: DeviceInfo, period: float) -> bool:
     """Returns True if neither a delay nor a rate of its own makes a device need more damping."""
     return bool(info.damping and info.delay is not None and Lag.of(info, period) == IN_TIME)
+
+
+def _facts(
+    shown: RunCoupling,
+    ways: Sequence[Alternative],
+    condition: DampingCondition | None,
+    info: DeviceInfo | None,
+) -> dict[str, object]:
+    """Returns what is printed as JSON of a coupling and its alternatives."""
+    return {
+        "needed": ways[0].needed if condition is None else condition.needed,
+        "frequency_hz": _hertz(ways[0]) if ways else None,
+        "method": default_method().name,
+        "coupling": asdict(shown),
+        "device": None if info is None else _device_facts(info, condition),
+        "alternatives": [
+            {"name": way.name, "needed": way.needed, "frequency_hz": _hertz(way)} for way in ways
+        ],
+    }
 
 
 def _device_facts(info: DeviceInfo, condition: DampingCondition | None) -> dict[str, object]:

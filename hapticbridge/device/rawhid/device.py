@@ -176,7 +176,7 @@ def data_sheet(
     if missing := [field for field in must if known[field] is None]:
         raise DeviceError(f"{name} does not report its {missing[0]}, which is required")
     delay, loop_rate = known.pop("delay"), known.pop("loop_rate")
-    suits = grip is None and _suits_own_loop(axes, is_posed=numbers.is_posed)
+    suits = grip is None and _loop_has(axes, is_posed=numbers.is_posed)
     known |= _own_loop(name, loop_rate if suits else None, known["loop_delay"])
     values: dict[str, Any] = {} if grip is None else grip.known() | of_grip
     if missing := [each for each in _GRIP_MUST_SAY if each in values and values[each] is None]:
@@ -195,7 +195,7 @@ def data_sheet(
         raise DeviceError(f"{name} reports an impossible data sheet: {error}") from None
 
 
-def _suits_own_loop(axes: tuple[str, ...], *, is_posed: bool) -> bool:
+def _loop_has(axes: tuple[str, ...], *, is_posed: bool) -> bool:
     """Returns True for a handle on lines, about one axis, or about all where the loop has rotation.
 
     The orientations of a handle about two axes are no rotation vectors of these two.

@@ -91,6 +91,10 @@ struct HbMotor {
 
 #include <avr/wdt.h>
 
+#ifdef HB_SKETCH_POSE
+#error "HB_SKETCH_POSE is for boards with a floating-point unit"
+#endif
+
 static const bool HB_HAS_LOOP = false;
 
 class HbSketchBoard {
