@@ -23,7 +23,6 @@ from hapticbridge.demand.certificate import conditions_of
 from hapticbridge.demand.guard import FADE
 from hapticbridge.demand.own_loop import REPORT_DTYPE, ROUNDING, OwnLoopTally
 from hapticbridge.device import Motion, SimulatedDevice
-from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.own_loop import BoardSetting, LoopReport, LoopState, ShownTool
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
 from hapticbridge.device.simulated.device import hand_for
@@ -69,12 +68,12 @@ class Bench:
             path=path,
         )
         self.mechanics, self.board = mechanics, LoopBoard(library, mechanics, own, link)
-        self.seam = HidSeam(self.board)
+        self.seam, self.said = HidSeam(self.board), list[str]()
         self.device = self.opened(**options)
 
     def opened(self, **options: object) -> RawHidDevice:
         """Opens the board, which has run since its start."""
-        return open_rawhid(options, ignore_message, self.seam, lambda: self.seam.now)
+        return open_rawhid(options, self.said.append, self.seam, lambda: self.seam.now)
 
     def bridge(self, coupling: Any = None, **options: Any) -> hb.Bridge:
         clock = DrivingClock(self.seam)
@@ -276,6 +275,9 @@ def test_a_boards_rotation_that_it_does_not_render_stays_with_the_bridge(
     ):
         bench = Bench(library, "point_mass", replace(SIX_AXES, axes=axes))
         assert (bench.device.info.loop_period is not None) is has_own
+        idle = [each for each in bench.said if "the loop on the board of 'board' does not" in each]
+        assert len(idle) == (not has_own)
+        assert not Bench(library, "point_mass", SIX_AXES, loop_rate=0.0).said
         with bench.bridge() as bridge:
             summary = bridge.run(0.4)
         assert summary.is_certified

@@ -342,6 +342,8 @@ class RawHidDevice:
         self.is_posed = pages[0].is_posed
         self.states = StateStream(name, is_posed=self.is_posed)
         self.info = data_sheet(name, pages, dict(changes or {}), round_trip)
+        has_loop = pages[0].loop_rate > 0.0 and (changes or {}).get("loop_rate") != 0.0
+        self._has_idle_loop = has_loop and self.info.loop_period is None
         self._mask = np.array([float(axis in self.info.axes) for axis in AXES])
         self._has_grip = self.info.grip_axis is not None
         self._sample = np.zeros(1 + self._has_grip, SAMPLE_DTYPE)
@@ -438,6 +440,14 @@ class RawHidDevice:
         self._is_open = False
         with released(self._link, self.last_word):
             self._end_force()
+
+    def say_idle_loop(self, notify: Notify) -> None:
+        """Tells the user of a loop on the board that cannot render the axes of the device."""
+        if self._has_idle_loop:
+            notify(
+                f"the loop on the board of '{self.info.name}' does not render all of its axes; "
+                "the bridge's loop renders them"
+            )
 
     def _end_force(self) -> None:
         self._send(force_frame(self._next(), NO_WRENCH, 1, is_enabled=False))
@@ -546,7 +556,7 @@ class RawHidDevice:
 
 def open_rawhid(
     options: Mapping[str, object],
-    _notify: Notify,
+    notify: Notify,
     api: HidApi | None = None,
     now: Callable[[], float] = time.monotonic,
 ) -> RawHidDevice:
@@ -562,6 +572,7 @@ def open_rawhid(
     with opened(DRIVER, options, api, slots=SLOTS) as (plugged, link):
         device = RawHidDevice(link, str(plugged), changes, now)
     device.info = replace(device.info, serial=plugged.serial)
+    device.say_idle_loop(notify)
     if api is None:
         zero = b"\0" + force_frame(0, NO_WRENCH, 1, is_enabled=False)
         device.last_word = guard_device_node(plugged.path, zero)
