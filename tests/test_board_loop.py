@@ -790,6 +790,16 @@ def test_a_force_frame_ends_a_setting_too(library: ctypes.CDLL) -> None:
     assert np.linalg.norm(board.force) > 0.5
 
 
+def test_a_position_that_is_no_place_is_told_as_an_encoders_fault(library: ctypes.CDLL) -> None:
+    for status in (0, Status.FAULT | 64):
+        board = at_a_wall(library)
+        board.position, board.status = np.full(3, np.nan), int(status)
+        board.run(1)
+        told = next(each for each in (board.state(), board.state()) if isinstance(each, LoopState))
+        assert told.status & Status.FAULT
+        assert told.status & Status.CAUSE == (64 if status else 128)
+
+
 @pytest.mark.parametrize(("pace_us", "missed"), [(100, 0), (101, 0), (110, 90), (200, 990)])
 def test_a_slow_timer_misses_periods(library: ctypes.CDLL, pace_us: int, missed: int) -> None:
     board = at_a_wall(library)

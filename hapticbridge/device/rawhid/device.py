@@ -295,8 +295,11 @@ NO_WRENCH = (0.0,) * 6
 
 _FAULTS: dict[int, tuple[str, str]] = {
     Cause.TEMPERATURE: ("that a motor or its driver is too hot", "let it cool, and home it"),
-    Cause.ENCODER: ("that an encoder is not read", "check its cable, and home it"),
-    Cause.DRIVER: ("that a motor's driver has switched off", "check its supply, and home it"),
+    Cause.ENCODER: ("that an encoder is not read", "check its cable, restart and home it"),
+    Cause.DRIVER: (
+        "that a motor's driver has switched off",
+        "check its supply, restart and home it",
+    ),
 }
 """Faults by their cause, each with a remedy."""
 

@@ -317,7 +317,7 @@ void HbDevice::loop_state(const HbMotion& motion, const HbReport& report, uint32
                           uint8_t frame[HB_FRAME_BYTES]) {
   begin_state(HB_KIND_LOOP, motion, now_us, frame);
   if (report.share > 0.0f) frame[3] |= HB_ENABLED;
-  if (report.is_faulty) frame[3] |= HB_FAULT;
+  if (report.is_faulty && (frame[3] & HB_FAULT) == 0) frame[3] |= HB_FAULT_ENCODER;
   put_vector(frame + 12, turns() ? motion.rotation : motion.position);
   put_vector(frame + 24, turns() ? motion.angular_velocity : motion.velocity);
   put_vector(frame + 36, report.force);
