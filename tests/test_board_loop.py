@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from board_attack import built_loop, floats, gained
 from board_processors import CORES, MOST, computed_here, computed_on, memory_on, missing
-from emulated.board_model import POSE
+from emulated.board_model import POSE, BoardSheet, Firmware
 from firmware_build import COMPILER, FIRMWARE
 from numpy.typing import NDArray
 
@@ -534,42 +534,41 @@ def test_raised_gains_give_the_spring_no_energy(library: ctypes.CDLL) -> None:
 
 
 class Board:
-    """A board in virtual time, whose handle is where ``position`` says."""
+    """A board in virtual time, whose handle is where ``position`` and ``turn`` say."""
 
     def __init__(self, library: ctypes.CDLL, axes: int = 0b111) -> None:
-        self._library = library
-        numbers = floats([2.0, 0.0, 0.0, 5.0, 5.0, 0.1, 1e-5, 2e-3, 1e-4, 0.3])
-        self._board = ctypes.c_void_p(library.board_new(axes, ctypes.c_float(PERIOD), numbers))
+        sheet = BoardSheet(axes=axes, friction=0.0, resolution=0.0, force_limit=5.0)
+        self._firmware = Firmware(library, sheet)
         self.turn, self.torque = np.array(UPRIGHT), np.zeros(3)
-        self.position, self.force, self.now = np.zeros(3), np.zeros(3), 0
+        self.position, self.force, self.now = np.zeros(3), np.zeros(3), 0.0
         self.status = 0
 
+    @property
+    def pose(self) -> NDArray[np.float32]:
+        return np.concatenate([self.position, self.turn]).astype(np.float32)
+
     def send(self, *frames: bytes) -> bool:
-        return all(self._library.board_receive(self._board, each, self.now) for each in frames)
+        return all(self._firmware.receive(each, self.now) for each in frames)
 
     def run(self, periods: int, pace_us: int = 100) -> None:
         wrench = np.zeros(6, np.float32)
         for _ in range(periods):
-            self.now += pace_us
-            pose = floats([*self.position, *self.turn])
-            self._library.board_tick(self._board, pose, self.now, floats(wrench))
+            self.now += 1e-6 * pace_us
+            self._firmware.tick(self.pose, self.now, wrench)
         self.force, self.torque = np.split(wrench.astype(np.float64), 2)
 
     def state(self) -> Any:
-        frame = ctypes.create_string_buffer(64)
-        pose = floats([*self.position, *self.turn])
-        self._library.board_state(self._board, pose, self.status, self.now, frame)
-        return decoded(frame.raw)
+        return decoded(self._firmware.state(self.pose, self.status, self.now))
 
     def more(self) -> Any:
-        frame = ctypes.create_string_buffer(64)
-        return decoded(frame.raw) if self._library.board_more(self._board, frame) else None
+        more = self._firmware.more()
+        return None if more is None else decoded(more)
 
     def numbers(self) -> Any:
-        frame = ctypes.create_string_buffer(64)
         assert self.send(ask_frame(1, 0))
-        assert self._library.board_answer(self._board, frame)
-        return decoded(frame.raw)
+        answer = self._firmware.answer()
+        assert answer is not None
+        return decoded(answer)
 
 
 TURNS = ROTATIONAL_STIFFNESS, ROTATIONAL_DAMPING, TORQUE_LEVEL

@@ -710,9 +710,9 @@ def test_the_motors_temperature_is_reported_and_warned_of_near_its_limit(
     bench, path = Bench(library), tmp_path / "run.mcap"
     with warnings.catch_warnings(record=True) as said, bench.bridge(recording=path) as bridge:
         warnings.simplefilter("always")
-        bench.board.heat(72.4, limit)
+        bench.board.firmware.heat(72.4, limit)
         bridge.run(0.2)
-        bench.board.heat(71.0, limit)
+        bench.board.firmware.heat(71.0, limit)
         summary = bridge.run(0.2)
     own = summary.certification.own_loop
     assert own is not None

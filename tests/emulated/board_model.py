@@ -42,6 +42,52 @@ class BoardSheet:
     torque_limit: float = 0.3
 
 
+class Firmware:
+    """The firmware's board, compiled; poses are position and quaternion, and times are in s.
+
+    Args:
+        library: ``board_attack.built_loop``.
+        sheet: What the board says.
+    """
+
+    def __init__(self, library: ctypes.CDLL, sheet: BoardSheet) -> None:
+        own, self._library = sheet, library
+        numbers = [own.damping, own.friction, own.resolution]
+        numbers += [own.force_limit, own.speed_limit, own.mass, own.loop_delay]
+        numbers += [own.rotational_damping, own.rotational_inertia, own.torque_limit]
+        new = library.board_new(own.axes, ctypes.c_float(own.period), floats(numbers))
+        self._board = ctypes.c_void_p(new)
+
+    def receive(self, frame: bytes, now: float) -> bool:
+        """Returns True if a frame from the host was taken."""
+        return bool(self._library.board_receive(self._board, frame, _us(now)))
+
+    def tick(self, pose: NDArray[np.float32], now: float, wrench: NDArray[np.float32]) -> None:
+        """Runs a period; ``wrench`` receives force and torque."""
+        self._library.board_tick(self._board, floats(pose), _us(now), floats(wrench))
+
+    def state(self, pose: NDArray[np.float32], status: int, now: float) -> bytes:
+        """Returns the next state frame."""
+        frame = ctypes.create_string_buffer(64)
+        self._library.board_state(self._board, floats(pose), status, _us(now), frame)
+        return frame.raw
+
+    def more(self) -> bytes | None:
+        """Returns the second frame of the last state; None without one."""
+        frame = ctypes.create_string_buffer(64)
+        return frame.raw if self._library.board_more(self._board, frame) else None
+
+    def answer(self) -> bytes | None:
+        """Returns the requested page of the sheet; None without a request."""
+        frame = ctypes.create_string_buffer(64)
+        return frame.raw if self._library.board_answer(self._board, frame) else None
+
+    def heat(self, temperature: float, limit: float) -> None:
+        """Sets the temperature of the motors and its limit in °C."""
+        numbers = ctypes.c_float(temperature), ctypes.c_float(limit)
+        self._library.board_heat(self._board, *numbers)
+
+
 class LoopBoard(HidDevice):
     """Runs the firmware's board in virtual time, with a handle in a hand behind it.
 
@@ -52,6 +98,7 @@ class LoopBoard(HidDevice):
         link: Further delay of the link in s, in each direction.
 
     Attributes:
+        firmware: The firmware.
         force: Force on the handle in N, or torque in N m of a device that only turns, (3,).
         torque: Torque on the handle in N m, where a loop renders lines and rotations, (3,).
         work: Energy in J that the motors have given the handle.
@@ -74,15 +121,10 @@ class LoopBoard(HidDevice):
         link: float = 0.0,
     ) -> None:
         super().__init__()
-        self.sheet, self._library, self._link = sheet or BoardSheet(), library, link
+        self.sheet, self._link = sheet or BoardSheet(), link
         own = self.sheet
-        self._is_posed = bool(own.axes & POSE)
-        self._is_knob = own.axes & 0b111 == 0 and not self._is_posed
-        numbers = [own.damping, own.friction, own.resolution]
-        numbers += [own.force_limit, own.speed_limit, own.mass, own.loop_delay]
-        numbers += [own.rotational_damping, own.rotational_inertia, own.torque_limit]
-        new = library.board_new(own.axes, ctypes.c_float(own.period), floats(numbers))
-        self._board = ctypes.c_void_p(new)
+        self.firmware = Firmware(library, own)
+        self._is_knob = own.axes & (0b111 | POSE) == 0
         self._mechanics, self._sample = mechanics, mechanics.start(own.period)
         mechanics.read(self._sample)
         self._wrench, self._sent = np.zeros(6, np.float32), np.zeros(6)
@@ -95,29 +137,23 @@ class LoopBoard(HidDevice):
         self.status = self.skip_every = 0
         self.has_counters, self.is_cut, self.loses_turns = True, False, False
 
-    def heat(self, temperature: float, limit: float) -> None:
-        """Sets the temperature of the motors and its limit in °C."""
-        numbers = ctypes.c_float(temperature), ctypes.c_float(limit)
-        self._library.board_heat(self._board, *numbers)
-
     def advance(self, now: float) -> None:
         if self._start is None:
             self._start = now
         while (due := self._start + (self._ticks + 1) * self.sheet.period) <= now + 1e-9:
             self._ticks += 1
             while self._to_board and self._to_board[0][0] <= due:
-                self._library.board_receive(self._board, self._to_board.popleft()[1], _us(due))
+                self.firmware.receive(self._to_board.popleft()[1], due)
             self._tick(due)
             if due - self._start >= (self._states + 1) * STATE_PERIOD:
                 self._states += 1
-                state = self._state(due)
+                state = self.firmware.state(self._read(), self.status, due)
                 if self.has_counters or not isinstance(decoded(state), LoopReport):
                     self._to_host.append((due + self._link, state))
-                    if self._is_posed:
-                        self._send_more(due)
-            frame = ctypes.create_string_buffer(64)
-            if self._library.board_answer(self._board, frame):
-                self._to_host.append((due + self._link, frame.raw))
+                if (more := self.firmware.more()) is not None and not self.loses_turns:
+                    self._to_host.append((due + self._link, more))
+            if (answer := self.firmware.answer()) is not None:
+                self._to_host.append((due + self._link, answer))
         while self._to_host and self._to_host[0][0] <= now:
             self.push(self._to_host.popleft()[1])
 
@@ -138,8 +174,7 @@ class LoopBoard(HidDevice):
     def _tick(self, due: float) -> None:
         own, before = self.sheet, self._sample[0].copy()
         if not self.skip_every or self._ticks % self.skip_every:
-            numbers = floats(self._read()), _us(due), floats(self._wrench)
-            self._library.board_tick(self._board, *numbers)
+            self.firmware.tick(self._read(), due, self._wrench)
         self._sent[:] = np.roll(self._wrench, 3) if self._is_knob else self._wrench
         self._mechanics.write(self._sent)
         self._mechanics.read(self._sample)
@@ -150,17 +185,6 @@ class LoopBoard(HidDevice):
         self.burned += own.rotational_damping / own.period * float(turned @ turned)
         if own.axes & 0b111:
             self.burned += own.damping / own.period * float(moved @ moved)
-
-    def _send_more(self, due: float) -> None:
-        frame = ctypes.create_string_buffer(64)
-        if self._library.board_more(self._board, frame) and not self.loses_turns:
-            self._to_host.append((due + self._link, frame.raw))
-
-    def _state(self, due: float) -> bytes:
-        frame = ctypes.create_string_buffer(64)
-        own = self._board, floats(self._read()), self.status, _us(due), frame
-        self._library.board_state(*own)
-        return frame.raw
 
 
 def _turn_of(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
