@@ -58,6 +58,10 @@ struct Message {
 
 extern "C" {
 
+void turn_between(const float* from, const float* to, float* turn) { hb_turn(from, to, turn); }
+
+void turn_from(const float* turn, const float* from, float* to) { hb_turned(turn, from, to); }
+
 Loop* loop_new(float period, int turns) { return new Loop(period, turns != 0); }
 
 void loop_set(Loop* loop, const float* numbers, int is_enabled) {

@@ -40,6 +40,7 @@ from hapticbridge.device.rawhid.protocol import (
 )
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
 from hapticbridge.kernel.pose import (
+    Quaternion,
     canonical,
     product,
     quaternion_exp,
@@ -393,6 +394,29 @@ def test_the_hosts_own_loop_bears_a_soft_one_behind_the_same_link(library: ctype
 
 
 # Rotation
+
+
+def unit(quaternion: Any) -> Quaternion:
+    """Returns a quaternion of length 1."""
+    w, x, y, z = map(float, quaternion)
+    return canonical((w, x, y, z))
+
+
+@pytest.mark.parametrize("size", [1e-8, 1e-6, 1e-4, 1e-2, 1.0, 3.0, 3.14])
+def test_a_small_turn_is_as_precise_as_a_large_one(library: ctypes.CDLL, size: float) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        first, turn = np.array(unit(rng.standard_normal(4))), rng.standard_normal(3)
+        turn *= size / np.linalg.norm(turn)
+        begin, end = first.astype(np.float32), turned_by(turn, first).astype(np.float32)
+        found, turned = np.zeros(3, np.float32), np.zeros(4, np.float32)
+        library.turn_between(floats(begin), floats(end), floats(found))
+        exact = rotation_between(unit(begin), unit(end))
+        # what rounding has left of a turn that is smaller than the step of the numbers
+        assert np.linalg.norm(found - exact) <= 3e-7 * np.linalg.norm(exact) + 1e-15
+        library.turn_from(floats(turn), floats(begin), floats(turned))
+        assert np.linalg.norm(turned) == pytest.approx(1.0, abs=2e-7)
+        assert twist_of(turned_by(turn, begin), unit(turned)) < 6e-7
 
 
 def twisted(library: ctypes.CDLL, **changes: float) -> Loop:

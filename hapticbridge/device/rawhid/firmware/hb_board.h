@@ -100,8 +100,8 @@ class HbBoardOf {
     return had_more;
   }
 
-  // Runs one period, in the timer's interrupt: `position` of the handle in m to `force` in N, or angles
-  // in rad to torques in N m of a device that only turns about one axis.
+  // Runs one period, in the timer's interrupt: `position` of the handle in m to `force` in N, or
+  // angles in rad to torques in N m of a device that only turns about one axis.
   void tick(const float position[3], uint32_t now_us, float force[3]) {
     tick(position, 0, now_us, force, 0);
   }

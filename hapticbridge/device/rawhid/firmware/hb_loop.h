@@ -23,10 +23,10 @@
 // sum P + V on a device of b >= K T/2 + B, whatever the host shows, and however late. The time t from
 // reading a position to its force counts, too: b >= K (T/2 + 3 t/2) + B is enough up to t = T.
 //
-// An HbPoseLoop has such a coupling of rotations beside it, with e the rotation vector from the tool to
-// the handle and dh, dy those of their motions; planes stop the tool's motion along lines alone. A
-// rotation's V is convex up to half a turn. Near and beyond it P is the least of f . dy and what the
-// spring and its damper give.
+// An HbPoseLoop has such a coupling of rotations beside it, with e the rotation vector from the
+// tool to the handle and dh, dy those of their motions; planes stop the tool's motion along lines
+// alone. A rotation's V is convex up to half a turn. Near and beyond it P is the least of f . dy and
+// what the spring and its damper give.
 //
 // A loop belongs to one interrupt. What a main loop receives for it is copied with interrupts off.
 //
@@ -224,7 +224,7 @@ class HbLoopOf {
   void tick(const float position[3], const float rotation[4], float force[3], float torque[3]) {
     Goal goal;
     Motion motion;
-    report_.is_faulty = report_.is_faulty || !is_place(position) || (TURNS && !hb_is_rotation(rotation));
+    if (!is_place(position) || (TURNS && !hb_is_rotation(rotation))) report_.is_faulty = true;
     if (report_.is_faulty) {
       memset(force, 0, 3 * sizeof(float));
       memset(report_.force, 0, sizeof report_.force);
