@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from typing import Literal
 
 from hapticbridge.arguments import check_fields, is_number, option, rule
 from hapticbridge.errors import CouplingError, choices
@@ -15,6 +16,8 @@ holds the tool's orientation more stiffly and needs more rotational damping of t
 
 _DERIVED = float("nan")
 # compared by identity, so that any other NaN is refused
+
+Axis = Literal["translation", "rotation"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +31,7 @@ class Coupling:
 
     and the device receives −f_k, −τ_k. All quantities are in the world frame: pose h of the handle
     and x of the grip, their orientations R, their rotation vectors δφ since the previous tick. T is
-    the period in s. The rotational spring is convex for |φ| < π; beyond, it jumps.
+    the period in s. The rotational spring is convex for −π < φ < π; beyond, it jumps.
 
     Attributes:
         stiffness: Stiffness K of the coupling in N/m. A run without it takes the stiffest that
@@ -66,6 +69,12 @@ class Coupling:
                 object.__setattr__(self, name, derived)
         # as floats, because MuJoCo gets −B, and −0 is another bit pattern than −0.0
         check_fields(self, CouplingError, "coupling ")
+
+    def gains(self, axis: Axis) -> tuple[float, float]:
+        """Returns K and B of translation, or K_r and B_r."""
+        if axis == "translation":
+            return self.stiffness, self.damping
+        return self.rotational_stiffness, self.rotational_damping
 
     def with_gains(self, gains: Mapping[str, float]) -> Coupling:
         """Returns the coupling with other gains by name.

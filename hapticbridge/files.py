@@ -100,7 +100,7 @@ def reason_of(error: OSError, target: Path) -> str:
         return f"the folder {target.parent} does not exist"
     if not os.path.isdir(folder):  # noqa: PTH112 - pathlib's raises without permission
         return f"{target.parent} is not a folder"
-    if words := temporary_words(error):
+    if words := folder_words(error):
         return words
     if error.errno == errno.ENOENT:  # as in /proc
         return f"the folder {target.parent} takes no new file"
@@ -147,10 +147,17 @@ def limit_words(number: int | None) -> str:
     return _LIMITS.get(number or 0, "")
 
 
-def temporary_words(error: OSError) -> str:
-    """Returns that no folder takes a temporary file if this is the error; else empty."""
+def folder_words(error: OSError) -> str:
+    """Returns that a folder of the process is missing if this is the error; else empty.
+
+    Only the current folder and that of temporary files are looked for without a name.
+    """
     if not isinstance(error, FileNotFoundError) or error.filename is not None:
         return ""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        return "the current folder was removed; change to another one"
     return f"{error.strerror}; free space there, lift 'ulimit -f', or set TMPDIR to another folder"
 
 

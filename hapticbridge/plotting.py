@@ -50,6 +50,25 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def _save(figure: Figure, target: Path | io.StringIO, **options: Any) -> None:
+    """Draws a figure into a file.
+
+    Raises:
+        HapticBridgeError: The user's settings have its texts set by LaTeX, which fails.
+    """
+    import matplotlib  # noqa: PLC0415 - takes 0.5 s
+
+    try:
+        _draw(figure, target, **options)
+    except RuntimeError as error:
+        if not matplotlib.rcParams["text.usetex"]:
+            raise
+        raise HapticBridgeError(
+            f"the picture cannot be drawn with LaTeX ({str(error).splitlines()[0]}); set "
+            f"text.usetex: False in '{matplotlib.matplotlib_fname()}'"
+        ) from None
+
+
+def _draw(figure: Figure, target: Path | io.StringIO, **options: Any) -> None:
     with warnings.catch_warnings():
         # characters missing in the font are drawn as boxes without a warning
         warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)
@@ -60,7 +79,8 @@ def write_picture(figure: Figure, path: Path) -> None:
     """Writes a figure in the format of the file's extension.
 
     Raises:
-        HapticBridgeError: The extension is no picture format, or the file cannot be written.
+        HapticBridgeError: The extension is no picture format, the file cannot be written, or LaTeX
+            fails.
     """
     check_ending(path)
     try:

@@ -1,7 +1,8 @@
 """Builds the documentation's site with Sphinx; ``scripts/docs`` installs what it needs first.
 
 The pages are those of ``hapticbridge guide``, of the scenes in ``models`` and the help texts of the
-commands. The reference of the Python interface comes from the docstrings.
+commands. The reference of the Python interface comes from the docstrings. A link to a page or a
+heading that does not exist is an error.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ autodoc_typehints = "description"
 napoleon_use_ivar = True
 myst_heading_anchors = 3
 highlight_language = "none"
-suppress_warnings = ["myst.xref_missing", "docutils", "ref.python"]
+suppress_warnings = ["ref.python"]
 """
 
 INTERFACE = {
@@ -111,7 +112,7 @@ def write_pages() -> None:
         reference += [heading(subject, "-"), *map(directive, names)]
     (SOURCE / "python.rst").write_text("".join(reference), encoding="utf-8")
     commands = [f"## {name}\n```text\n{help_of(name)}```\n" for name in COMMANDS]
-    (SOURCE / "run.commands.md").write_text("# Commands\n" + "\n".join(commands), encoding="utf-8")
+    (SOURCE / "commands.md").write_text("# Commands\n" + "\n".join(commands), encoding="utf-8")
     contents = [
         toctree(kind, [f"guide/{topic.replace('-', '_')}" for topic in topics])
         for kind, topics in TOPICS.items()

@@ -168,7 +168,7 @@ def test_certificate_is_the_device_condition_with_what_is_used(
     report = audit(path)
     assert report.verdict == "passive"
     assert report.certified is certified
-    assert "law 0.5" in report.coupling_sentences[0]
+    assert "B_law = 0.5" in report.coupling_sentences[0]
     assert report.coupling is not None
     assert report.coupling.requested == felt
     assert report.coupling.law is not None

@@ -81,7 +81,7 @@ def test_a_device_is_certified_for_its_delay_and_not_for_an_unknown_one() -> Non
     assert is_certified(late) is True
     assert is_certified(unknown) is None
     assert late[0].sentence().endswith("2 >= 0.45 N s/m with its delay of 2 ms")
-    assert "without delay, which is unknown" in unknown[0].sentence()
+    assert "its delay is unknown; without one, " in unknown[0].sentence()
     stiff = conditions_of(loop_of(info(delay=2e-3), SPRING))
     assert is_certified(stiff) is False
 

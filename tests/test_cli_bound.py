@@ -99,7 +99,7 @@ BORNE = "next: hapticbridge run SCENE --stiffness 2400 --damping 1.7 --device si
         ({"damping": 0.0}, 1, "translation: device damping 0 < 1.7 N s/m"),
         ({"damping": 9.0, "delay": 1e-3}, 0, "with its delay of 1 ms"),
         ({"delay": 1e-3}, 1, "translation: device damping 2 < "),
-        ({"delay": None}, 0, "if it answers without delay, which is unknown"),
+        ({"delay": None}, 0, "its delay is unknown; without one, device damping"),
         ({"rate": 500.0}, 1, "lower the stiffness to 1700 N/m, or take a device with 2.824 N s/m"),
         ({"damping": None}, 2, "its damping is unknown; 'hapticbridge identify' measures it"),
     ],

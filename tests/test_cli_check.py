@@ -108,8 +108,9 @@ def test_check_says_where_a_urdf_that_does_not_compile_takes_its_inertia(
 def test_check_draws_a_motion_too_short_to_measure_growth(tmp_path: Path, call: Called) -> None:
     picture, motion = tmp_path / "check.png", tmp_path / "short.csv"
     motion.write_text("t,x,y,z\n0,0,0,0\n0.05,0.001,0,0\n")
-    code, _, err = call("check", "point_mass", "--motion", motion, "--plot", picture)
+    code, out, err = call("check", "point_mass", "--motion", motion, "--plot", picture)
     assert code == 0, err
+    assert f"run point_mass --device simulated:path={motion}" in " ".join(out.split())
     assert picture.exists()
 
 
@@ -168,6 +169,20 @@ def test_parameters_of_a_scene_are_checked_as_set(call: Called) -> None:
     assert facts["inventory"]["possible_pairs"] == 5
     usual = facts_of(call, "check", "peg_in_hole")[1]["inventory"]
     assert facts["inventory"]["deepest"] != usual["deepest"]
+
+
+@pytest.mark.parametrize(("margin", "words"), [(0, "sank in by"), (0.003, "a margin kept 3 mm")])
+def test_a_tool_that_a_margin_keeps_away_did_not_sink_in(
+    margin: float, words: str, tmp_path: Path, call: Called
+) -> None:
+    floor = f"<geom type='plane' size='1 1 1' margin='{margin}'/>"
+    tool = "<geom type='box' size='.02 .02 .02' mass='.1'/><site name='grip'/>"
+    body = f"<body pos='0 0 {0.02 + margin}'><joint type='slide' axis='0 0 1'/>{tool}</body>"
+    path = tmp_path / "a.xml"
+    path.write_text(f"<mujoco><worldbody>{floor}{body}</worldbody></mujoco>")
+    code, out, _ = call("check", path)
+    (line,) = (each for each in out.splitlines() if "contact stiffness" in each)
+    assert (code, words in line, "-" in line) == (0, True, False)
 
 
 def test_check_leaves_no_log_of_mujocos_warnings(

@@ -235,6 +235,68 @@ def test_results_that_nobody_has_room_for_are_one_sentence() -> None:
     assert one_sentence(done.stderr) == "error: cannot write: No space left on device"
 
 
+PRINTED = {
+    "PYTHONIOENCODING=ascii": "2 \\xb5m wide",
+    "PYTHONIOENCODING=latin-1": "2 µm wide",
+    "COLUMNS=0": "2 µm wide",
+    "COLUMNS=10": "2 µm wide",
+}
+"""Words on stdout, by the encoding or width that the terminal states."""
+
+
+@pytest.mark.parametrize("setting", PRINTED)
+def test_results_are_printed_whatever_the_terminal_states(setting: str, tmp_path: Path) -> None:
+    about = "<custom><text name='about' data='2 µm wide'/></custom>"
+    body = "<worldbody><body><freejoint/><geom size='1'/></body></worldbody>"
+    (tmp_path / "a.xml").write_text(f"<mujoco>{about}{body}</mujoco>", encoding="utf-8")
+    command = [sys.executable, "-m", "hapticbridge", "scenes", str(tmp_path / "a.xml")]
+    name, _, value = setting.partition("=")
+    environment = os.environ | {"PYTHONIOENCODING": "utf-8"} | {name: value}
+    done = subprocess.run(command, env=environment, capture_output=True, check=False)
+    encoding = "utf-8" if name == "COLUMNS" else value
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert PRINTED[setting] in done.stdout.decode(encoding)
+
+
+@pytest.mark.parametrize("setting", ["backend: nonsense", "text.usetex: True", "MPLBACKEND"])
+def test_pictures_are_drawn_with_the_users_settings_or_what_fails_is_told(
+    setting: str, tmp_path: Path
+) -> None:
+    (tmp_path / "rc").write_text("" if setting == "MPLBACKEND" else setting)
+    picture = tmp_path / "a.png"
+    words = ["zwidth", "--damping", "2", "--plot", str(picture)]
+    environment = os.environ | {"MATPLOTLIBRC": str(tmp_path / "rc"), "PATH": ""}
+    environment |= {"MPLBACKEND": "nonsense"} if setting == "MPLBACKEND" else {}
+    command = [sys.executable, "-m", "hapticbridge", *words]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert "Traceback" not in done.stderr
+    if setting == "text.usetex: True":
+        assert (done.returncode, picture.exists()) == (2, False)
+        sentence = f"set text.usetex: False in '{tmp_path / 'rc'}'"
+        assert one_sentence(done.stderr).endswith(sentence)
+    else:
+        assert (done.returncode, picture.exists()) == (0, True)
+
+
+@pytest.mark.parametrize("command", ["bound", "run"])
+def test_help_does_not_need_the_docstrings_that_python_drops(command: str, call: Called) -> None:
+    words = [sys.executable, "-OO", "-m", "hapticbridge", command, "--help-all"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == call(command, "--help-all")[1]
+
+
+def test_a_current_folder_that_was_removed_is_the_reason(tmp_path: Path) -> None:
+    script = f"import os; os.chdir({str(tmp_path)!r}); os.rmdir(os.getcwd()); " + LOADED
+    words = ["run", "point_mass", "--fast", "--duration", "0.01", "--record", "a.mcap"]
+    command = [sys.executable, "-P", "-c", script, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert one_sentence(done.stderr.partition("loaded:")[0]) == (
+        "error: the current folder was removed; change to another one"
+    )
+
+
 @pytest.mark.parametrize("content", [None, b"", b"hello"])
 def test_what_is_no_recording_is_refused_in_one_sentence(
     content: bytes | None, call: Called, tmp_path: Path

@@ -127,9 +127,9 @@ def test_one_damping_is_printed_before_the_run_after_it_and_by_the_audit(
     scene, record = tmp_path / "block.xml", tmp_path / "block.mcap"
     scene.write_text(RESTING)
     _, out, err = call("run", scene, "--fast", "--duration", 0.1, "--record", record)
-    usual = "K = 2400 N/m, B = 1.7 N s/m effective (law 0.5, requested 1.7"
+    usual = "K = 2400 N/m, B = 1.7 N s/m (B_law = 0.5"
     assert f"{usual})\n" in err
-    held = f"{usual}, near contact or held, as here: 2.9)\n"
+    held = f"{usual}, near contact or held, as here: B = 2.9)\n"
     assert held in out
     assert held in call("audit", record)[1]
 

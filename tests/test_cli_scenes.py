@@ -36,6 +36,11 @@ def test_a_scene_of_one_s_own_is_shown_whatever_its_grip_is_called(
     assert code == 2
     assert f"'m.stl', looked for in '{tmp_path}' and its meshdir or texturedir" in err
     assert err.rstrip().endswith("if it names one")
+    for absolute in ("/nowhere/m.stl", "C:/nowhere/m.stl"):
+        path.write_text(f"<mujoco>{mesh}</worldbody></mujoco>".replace("m.stl", absolute))
+        code, _, err = call("scenes", path)
+        sentence = f"'{absolute}', an absolute path; write it relative to the scene's file"
+        assert (code, err.rstrip().endswith(sentence)) == (2, True)
 
 
 @pytest.mark.parametrize("is_mended", [False, True])

@@ -12,6 +12,7 @@ import h5py
 import mujoco
 import numpy as np
 import pytest
+from audit_cases import recorded
 from cli_cases import Called, one_sentence
 from PIL import Image
 
@@ -91,6 +92,25 @@ def test_pictures_show_the_scene_without_arrows(runs: list[Path], tmp_path: Path
         np.testing.assert_array_equal(file["data/demo_0/obs/free_image"][-1], picture)
 
 
+def test_a_camera_of_an_attached_part_has_a_name_that_learners_take(tmp_path: Path) -> None:
+    """LeRobot refuses a feature with '/', and HDF5 makes a group of it."""
+    camera = "<camera name='arm/hand' pos='0 0 1'/>"
+    body = "<body><freejoint/><geom size='.02'/><site name='grip'/></body>"
+    scene = tmp_path / "a.xml"
+    scene.write_text(f"<mujoco><worldbody>{camera}{body}</worldbody></mujoco>")
+    recorded(tmp_path / "run.mcap", scene, duration=0.3)
+    shot = Shot(fps=10, camera="arm/hand", width=32, height=32)
+    folder = write_dataset([tmp_path / "run.mcap"], "lerobot", tmp_path / "set", shot).folder
+    assert len(lerobot(folder, 0)["observation.images.arm_hand"]) == 2
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    assert "observation.images.arm_hand" in info["features"]
+    assert not any("/" in name for name in info["features"])
+    write_dataset([tmp_path / "run.mcap"], "robomimic", tmp_path / "other", shot)
+    with h5py.File(tmp_path / "other" / "demos.hdf5") as file:
+        assert all(isinstance(each, h5py.Dataset) for each in file["data/demo_0/obs"].values())
+        assert file["data/demo_0/obs/arm_hand_image"].shape == (2, 32, 32, 3)
+
+
 def test_lerobot_finds_what_its_description_says(runs: list[Path], tmp_path: Path) -> None:
     folder = write_dataset(runs, "lerobot", tmp_path / "set", task="turn it").folder
     info = json.loads((folder / "meta" / "info.json").read_text())
@@ -161,6 +181,32 @@ def test_what_cannot_be_learned_from_is_refused_and_leaves_nothing(
     with pytest.raises(RecordingError, match="exists"):
         write_dataset(runs, "lerobot", target)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap", "other.mcap", "set"]
+
+
+def test_a_programs_run_has_its_tool_and_says_where_it_was_placed_anew(
+    call: Called, tmp_path: Path
+) -> None:
+    path = tmp_path / "own.mcap"
+    with hb.DeviceLoop("simulated", recording=path, is_simulated=True) as device:
+        for place in (0.0, 0.05):
+            device.show([place, 0.0, 0.0], is_placed=True)
+            for _ in range(10):
+                device.advance(0.02)
+                device.show([place, 0.0, 0.0])
+    events = hb.audit(path, in_process=True).events
+    assert (events["placed"] >= 2, "reset" in events) == (True, False)
+    assert 20 <= events["shown"] <= 22
+    folder = tmp_path / "set"
+    code, _, err = call("export", path, "--format", "lerobot", "--out", folder)
+    assert code == 0
+    jumps = write_dataset([path], "lerobot", tmp_path / "again").resets[0]
+    assert [pytest.approx(time, abs=2e-3) for time in jumps] == [0.2]
+    assert f"was reset at {jumps[0]:.3f} s: its episode jumps there" in " ".join(err.split())
+    columns = lerobot(folder, 0)
+    assert "observation.qpos" not in columns
+    state = np.array(columns["observation.state"])
+    assert state[0, 0] == 0.0
+    assert state[-1, 0] == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 import socket
 import threading
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -361,6 +363,11 @@ def test_no_service_socket_or_package_is_one_sentence(monkeypatch: pytest.Monkey
         open_device(f"haply:service=localhost:{port}")
     assert haply.find(("localhost", port)) == []
     assert "does not run" in haply.medium(("localhost", port))
+    unreachable = OSError(errno.ENETUNREACH, "Network is unreachable")
+    with monkeypatch.context() as patch:
+        patch.setattr(socket, "create_connection", Mock(side_effect=unreachable))
+        with pytest.raises(DeviceError, match="cannot be reached: Network is unreachable at 10"):
+            open_device("haply:service=10.0.0.9:10001")
     for host in ("no.such.invalid", "a..b"):
         with pytest.raises(DeviceError, match=f"^there is no host '{host}' for the Inverse Serv"):
             open_device(f"haply:service={host}:{port}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -61,11 +62,11 @@ def ramp(count: int = 5, start: int = 10**18, late: int = 7) -> list[tuple[int, 
     return [(at + late, pose_message(at, 1e-3 * i)) for i, at in enumerate(stamps)]
 
 
-def write_ramp(writer: Any) -> None:
+def write_ramp(writer: Any, encoding: str = "cdr") -> None:
     """Writes a whole bag of poses on ``/hand``."""
     writer.start("ros2", "a test")
     schema = writer.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", b"")
-    channel = writer.register_channel("/hand", "cdr", schema)
+    channel = writer.register_channel("/hand", encoding, schema)
     for time, data in ramp():
         writer.add_message(channel, time, data, time)
     writer.finish()
@@ -232,6 +233,57 @@ def test_big_endian_poses_are_read(tmp_path: Path) -> None:
         messages.append((i, head + bytes(0) + struct.pack(">7d", i * 1e-3, 0, 0, 0, 0, 0, 1)))
     (file,) = bag(tmp_path / "big", {"/hand": messages}).glob("*.mcap")
     np.testing.assert_allclose(read_bag(file).table[:, 1], [0, 1e-3, 2e-3])
+
+
+@pytest.mark.parametrize("frame", [b"\0", b"w\0", b"map\0", b"world\0", b"a hand\0"])
+@pytest.mark.parametrize("representation", [6, 7])
+def test_poses_in_the_second_version_of_cdr_are_read(
+    representation: int, frame: bytes, tmp_path: Path
+) -> None:
+    """There, numbers of 8 bytes lie at a multiple of 4."""
+    order, messages = "<" if representation & 1 else ">", []
+    for i in range(3):
+        head = struct.pack(f"{order}iII", 5, 10**7 * i, len(frame)) + frame
+        head += bytes(-len(head) % 4)
+        numbers = struct.pack(f"{order}7d", i * 1e-3, 2, 3, 0, 0, 0, 1)
+        messages.append((i, bytes([0, representation, 0, 0]) + head + numbers))
+    (file,) = bag(tmp_path / "second", {"/hand": messages}).glob("*.mcap")
+    right = [[0.01 * i, 1e-3 * i, 2, 3, 1, 0, 0, 0] for i in range(3)]
+    np.testing.assert_allclose(read_bag(file).table, right, atol=1e-12)
+
+
+@pytest.mark.parametrize("representation", [2, 3, 8, 9, 0x107])
+def test_another_representation_is_told(representation: int, tmp_path: Path) -> None:
+    messages = [(at, struct.pack(">H", representation) + data[2:]) for at, data in ramp()]
+    (file,) = bag(tmp_path / "other", {"/hand": messages}).glob("*.mcap")
+    with pytest.raises(DeviceError, match=rf"\(its representation is 0x{representation:04x}; of"):
+        read_bag(file)
+
+
+def test_poses_in_another_encoding_than_cdr_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "hand.mcap"
+    with path.open("wb") as file:
+        writer: Any = McapWriter(file)
+        write_ramp(writer, "json")
+    with pytest.raises(DeviceError, match=r"read \(its encoding is 'json', not 'cdr'\)"):
+        read_bag(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t x y z\n0 0 0 0\n1 0 0 0\n",
+        "t|x|y|z\n0|0|0|0\n1|0|0|0\n",
+        "# time x y z\n0.0 0 0 0\n1.0 0 0 0\n",
+    ],
+)
+def test_columns_with_another_separator_are_told(text: str, tmp_path: Path) -> None:
+    (tmp_path / "hand.csv").write_text(text)
+    with pytest.raises(DeviceError, match="are not separated by commas, semicolons or tabs"):
+        read_motion(tmp_path / "hand.csv")
+    (tmp_path / "hand.csv").write_text(text.replace("#", "").replace("|", ",").replace(" ", ","))
+    with pytest.raises(DeviceError, match="column t") if "#" in text else nullcontext():
+        read_motion(tmp_path / "hand.csv")
 
 
 def test_an_exported_recording_is_the_motion_of_its_device(tmp_path: Path) -> None:

@@ -112,8 +112,12 @@ TURNED = "t,x,y,z,qw,qx,qy,qz\n"
 )
 def test_columns_may_be_separated_as_other_programs_do(tmp_path: Path, text: str) -> None:
     file = tmp_path / "motion.csv"
-    file.write_text(text, encoding="utf-8")
-    assert read_motion(file).table[1, :4].tolist() == [0.5, 0.01, -0.001, 0.0]
+    for encoding in ("utf-8", "utf-8-sig", "utf-16"):
+        file.write_text(text, encoding=encoding)
+        assert read_motion(file).table[1, :4].tolist() == [0.5, 0.01, -0.001, 0.0]
+    file.write_bytes(text.encode("utf-16")[:-1])
+    with pytest.raises(DeviceError, match="not UTF-16 text"):
+        read_motion(file)
 
 
 @pytest.mark.parametrize(

@@ -17,11 +17,11 @@ from hapticbridge.files import (
     atomic_write,
     check_target,
     finite_or_null,
+    folder_words,
     install_command,
     prepared_folder,
     read_json,
     reason_of,
-    temporary_words,
 )
 
 
@@ -163,5 +163,5 @@ def test_without_room_for_temporary_files_that_is_the_reason(
     with pytest.raises(OSError, match="No usable temporary directory") as found:
         tempfile.gettempdir()
     assert reason_of(found.value, tmp_path / "x").startswith("No usable temporary directory found")
-    assert "set TMPDIR" in temporary_words(found.value)
-    assert temporary_words(FileNotFoundError(2, "No such file", "x")) == ""
+    assert "set TMPDIR" in folder_words(found.value)
+    assert folder_words(FileNotFoundError(2, "No such file", "x")) == ""

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel import jit, machine_code
 from hapticbridge.kernel.jit import Program, compiled, direct, external, prepare
 from hapticbridge.kernel.jit import compiled_for_threads as threaded
@@ -278,6 +279,17 @@ def test_code_that_numba_cannot_write_goes_nowhere_else(folder: Path) -> None:
     own.touch()  # a file where numba wants a folder
     assert compiled(allocating)(table) == 0.0
     assert not list((Path(__file__).parent / "__pycache__").glob("test_machine_code*.nb?"))
+
+
+def test_a_compiler_that_the_user_disabled_is_told(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("numba.config.DISABLE_JIT", 1)
+    with pytest.raises(HapticBridgeError, match=r"^NUMBA_DISABLE_JIT is set, and .*; unset it$"):
+        compiled(rows_of)(np.zeros((3, 4)))
+    monkeypatch.setattr("numba.config.DISABLE_JIT", 0)
+    assert compiled(rows_of)(np.zeros((3, 4))) == 43
+    assert list(folder.iterdir())
 
 
 OPEN: dict[str, tuple[str, int]] = {

@@ -346,6 +346,21 @@ def test_a_scene_names_only_files_of_its_own_folder(text: str, is_refused: bool)
     refuse_outside(b"<mesh file='../shared/a.stl'/>", "scenes/main.xml")
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no file there has such a name")
+@pytest.mark.parametrize("name", ["a:b", "run 12:30:01"])
+def test_a_colon_in_the_name_of_a_file_is_a_letter(name: str, tmp_path: Path) -> None:
+    mesh = f"<asset><mesh name='m' file='{name}.obj'/></asset>"
+    body = "<body><freejoint/><geom type='mesh' mesh='m'/><site name='grip'/></body>"
+    (tmp_path / f"{name}.obj").write_text("v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\n")
+    scene = tmp_path / f"{name}.xml"
+    scene.write_text(f"<mujoco><option/>{mesh}<worldbody>{body}</worldbody></mujoco>")
+    recorded(tmp_path / "run.mcap", scene, duration=0.01)
+    for path in tmp_path.glob(f"{name}.*"):
+        path.unlink()
+    report = audit(tmp_path / "run.mcap")
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
 def test_names_that_climb_by_steps_do_not_leave_the_folder_in_this_process_either(
     honest: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

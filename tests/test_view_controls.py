@@ -39,8 +39,8 @@ from hapticbridge.view.server import serve, stop
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 CLUTCH = "clutch (the hand moves alone)"
-K, B = "stiffness K (N/m)", "requested damping B (N s/m)"
-KR, BR = "turning stiffness K_r (N m/rad)", "requested turning damping B_r (N m s/rad)"
+K, B = "stiffness K (N/m)", "damping B (N s/m)"
+KR, BR = "turning stiffness K_r (N m/rad)", "turning damping B_r (N m s/rad)"
 
 PATIENCE = 60.0
 """Time limit in s for anything to happen in a run, which ends after twice as long."""

@@ -46,6 +46,7 @@ from hapticbridge.files import finite_or_null
 from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
 from hapticbridge.kernel.record import CLOCK_FIELDS
 from hapticbridge.recording import RecordingFile
+from hapticbridge.recording.format import SHOWN_EVENT
 from hapticbridge.recording.reader import open_hands
 from hapticbridge.run.description import meta_start, requested_of
 from hapticbridge.run.summary import Environment, posted_words, was_never_lossless
@@ -769,8 +770,11 @@ def _replay_fault(outcome: ReplayOutcome) -> Fault | None:
 def _event_counts(recording: RecordingFile) -> dict[str, int]:
     counts: dict[str, int] = {}
     for event in recording.events:
-        name = str(event.get("event", "unnamed"))
-        counts[name] = counts.get(name, 0) + 1
+        name, count = str(event.get("event", "unnamed")), event.get("count")
+        if name == "reset" and event.get("by") == "program":
+            name = "placed"
+        shown = count if name == SHOWN_EVENT and type(count) is int else 1
+        counts[name] = counts.get(name, 0) + shown
     return counts
 
 

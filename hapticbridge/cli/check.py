@@ -188,9 +188,10 @@ def print_inventory(inventory: Inventory, contact: str) -> None:
             lines[f"{kind} rows"] = f"at most {largest} in a step, median {median:g}"
     if inventory.stiffness is not None:
         least, most = (f"{float(f'{1e-3 * each:.3g}'):,g}" for each in inventory.stiffness)
+        depth = length(abs(inventory.deepest))
+        sank = f"sank in by {depth}" if inventory.deepest >= 0.0 else f"a margin kept {depth} away"
         lines["contact stiffness"] = (
-            f"{least} to {most} kN/m at the tool, which sank in by {length(inventory.deepest)} "
-            f"({_CONTACTS[contact]})"
+            f"{least} to {most} kN/m at the tool, which {sank} ({_CONTACTS[contact]})"
         )
     if inventory.bounces:
         each = (f"{one.names}, e at most {one.e:.2g}" for one in inventory.bounces)
@@ -410,8 +411,7 @@ class Check:
             print_cost(cost)
             print_faults(faults, is_urdf=b"<robot" in source.sources[0].data)
             if is_sound:
-                grip = "" if self.grip == "grip" else f" --grip {shlex.quote(self.grip)}"
-                out.print(f"next: hapticbridge run {plain(shlex.quote(self.scene))}{grip}")
+                out.print(f"next: {plain(self._next)}")
         lean = self._looked_for(case, budget) if wants_lean else None
         written = None if lean is None else self._print_lean(lean)
         if self.as_json:
@@ -425,6 +425,15 @@ class Check:
             err.print(f"{outcome} {plain(str(self.plot))}")
         is_worse = written is not None and written.verdict not in (MAY_GO, SAVES_NOTHING)
         return 1 if not is_sound or is_worse or (wants_lean and lean is None) else 0
+
+    @property
+    def _next(self) -> str:
+        """Command that runs the scene, with the same motion."""
+        grip = "" if self.grip == "grip" else f" --grip {shlex.quote(self.grip)}"
+        is_table = self.motion is not None and self.motion.suffix == ".csv"
+        led = f"{'simulated:path=' if is_table else 'trajectory:'}{self.motion or ''}"
+        device = f" --device {shlex.quote(led)}" if self.motion else ""
+        return f"hapticbridge run {shlex.quote(self.scene)}{grip}{device}"
 
     def _looked_for(self, case: SceneUnderCheck, budget: float) -> Lean | None:
         """Looks for what could go; None, and a sentence, where the scene must be mended first."""

@@ -13,10 +13,13 @@ import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
-from typing import Any, Literal, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 from hapticbridge.arguments import Rule, members, rule_of, shown, types_of, value_from
 from hapticbridge.errors import HapticBridgeError, nearest
+
+if TYPE_CHECKING:
+    import ast
 
 Path = tuple[str, ...]
 
@@ -227,21 +230,28 @@ def built(kind: Any, values: Mapping[Path, Any], path: Path = ()) -> Any:
 # Help
 
 
+def _source_of(kind: Any) -> tuple[str, list[ast.stmt]]:
+    """Returns docstring and statements of a class, from its source: 'python -OO' drops them."""
+    import ast  # noqa: PLC0415 - for help alone
+    import inspect  # noqa: PLC0415
+
+    [definition] = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    assert isinstance(definition, ast.ClassDef)
+    return ast.get_docstring(definition) or "", definition.body
+
+
 @cache
 def texts_of(kind: Any) -> dict[str, str]:
     """Returns the text of each field: ``Attributes`` of the docstring, or below the field."""
     import ast  # noqa: PLC0415 - for help alone
-    import inspect  # noqa: PLC0415
     from itertools import pairwise  # noqa: PLC0415
 
-    section = (inspect.getdoc(kind) or "").partition("\nAttributes:\n")[2]
-    section = re.split(r"\n(?=\S)", section)[0]
+    docstring, statements = _source_of(kind)
+    section = re.split(r"\n(?=\S)", docstring.partition("\nAttributes:\n")[2])[0]
     entries = re.findall(r"^    (\w+): (.*(?:\n      +.*)*)", section, flags=re.MULTILINE)
-    [body] = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
-    assert isinstance(body, ast.ClassDef)
     below = [
         (option.target.id, ast.literal_eval(text.value))
-        for option, text in pairwise(body.body)
+        for option, text in pairwise(statements)
         if isinstance(option, ast.AnnAssign)
         and isinstance(option.target, ast.Name)
         and isinstance(text, ast.Expr)
@@ -263,14 +273,12 @@ def usage(command: type[Any], name: str) -> str:
 
 def help_page(command: type[Any], name: str, *, is_whole: bool) -> str:
     """Returns the help of a command: its ``FIRST_OPTIONS`` in short, or all options in full."""
-    import inspect  # noqa: PLC0415 - for help alone
-
     flags = list(flags_of(command))
     first = getattr(command, "FIRST_OPTIONS", ())
     is_whole = is_whole or not first
     shown_flags = [f for f in flags if is_whole or (f.rule.flag or f.path[-1]) in first]
     lines = [f"usage: {usage(command, name)}", ""]
-    for paragraph in (inspect.getdoc(command) or "").split("\n\n"):
+    for paragraph in _source_of(command)[0].split("\n\n"):
         is_example = "\n " in paragraph
         lines += paragraph.splitlines() if is_example else _wrapped(paragraph, "")
         lines.append("")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import io
 import os
 import signal
 import sys
@@ -81,6 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Words after the program's name; None takes those of the process.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    _prepare_output()
     try:
         if words[:1] == ["--version"]:
             code = _print_version()
@@ -106,6 +108,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (MemoryError, ImportError, OSError, RuntimeError) as error:
         code = _system_fault(error)
     return code
+
+
+def _prepare_output() -> None:
+    """Lets texts be printed and pictures be drawn, whatever terminal the environment states.
+
+    Python escapes on stderr what an encoding lacks, such as the µ of a unit, and fails on stdout.
+    A width of 0 is that of a terminal whose width is not known; rich would print nothing.
+    Pictures need no window: matplotlib would refuse to be imported for one that it does not know.
+    """
+    os.environ["MPLBACKEND"] = "agg"
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+    for name in ("COLUMNS", "LINES"):
+        if set(os.environ.get(name, "")) == {"0"}:
+            del os.environ[name]
 
 
 MIN_MEMORY, MEMORY_PER_PROCESSOR = 1 << 30, 1 << 27
@@ -172,10 +189,10 @@ def _system_fault(error: MemoryError | ImportError | OSError | RuntimeError) -> 
         if str(error) != _NO_THREAD:
             raise error
         number = errno.EAGAIN
-    from hapticbridge.files import limit_words, temporary_words  # noqa: PLC0415 - for an error alone
+    from hapticbridge.files import folder_words, limit_words  # noqa: PLC0415 - for an error alone
 
     words = limit_words(number)
-    if words := words or (temporary_words(error) if isinstance(error, OSError) else ""):
+    if words := words or (folder_words(error) if isinstance(error, OSError) else ""):
         return _say("error", words)
     is_full = not isinstance(error, OSError) or error.errno in (None, errno.ENOMEM)
     if is_full and _is_memory_limited():

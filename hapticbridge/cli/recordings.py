@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -127,8 +127,8 @@ class Export:
     'parquet', 'csv' and 'hdf5' have a row per tick, with units, metadata and events. 'rerun' is a
     file for the viewer of that name, 'foxglove' a layout for Foxglove, which opens the recording
     itself. 'lerobot' and 'robomimic' write a folder with an episode for each recording, simulated
-    again. --from and --to cut a piece out of a run; the times of its marks are printed. Exit code
-    1 if the recording is damaged: of what can be read, tables are written all the same.
+    again. --from and --to cut a piece out of a run, for tables; the times of its marks are printed.
+    Exit code 1 if the recording is damaged: of what can be read, tables are written all the same.
 
     Example:
         hapticbridge export run.mcap --format csv --from 12.5 --to 20 --out grasp.csv
@@ -158,7 +158,8 @@ class Export:
     fps: int | None = None
     """Frames per second of a data set, by default 30."""
     camera: str | None = None
-    """Camera of the scene whose pictures a data set holds, or 'free'; by default none."""
+    """Camera of the scene whose pictures a data set holds, or 'free'; by default none. A '/' of its
+    name becomes '_' there."""
     size: tuple[int, int] | None = option(None, metavar="W H")
     """Width and height of the pictures in pixels, both even; by default 320 240."""
     task: str | None = None
@@ -217,12 +218,19 @@ class Export:
                 self.files, self.form, self.out or self.form, shot, task=self.task, progress=show
             )
         if self.as_json:
-            print_json({"folder": str(done.folder), "episodes": done.episodes})
+            print_json(asdict(done) | {"folder": str(done.folder)})
         else:
             frames = f"{sum(done.episodes)} frames at {shot.fps} Hz"
             count = len(done.episodes)
             episodes = "1 episode" if count == 1 else f"{count} episodes"
             out.print(f"wrote {plain(str(done.folder))}: {episodes}, {frames}")
+        for file, resets in zip(self.files, done.resets, strict=True):
+            if resets:
+                times = ", ".join(f"{time:.3f} s" for time in resets)
+                err.print(
+                    f"[yellow]warning:[/yellow] the scene of {plain(str(file))} was reset at "
+                    f"{times}: its episode jumps there; an episode needs a recording of its own"
+                )
         return 0
 
 

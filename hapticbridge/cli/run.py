@@ -103,8 +103,9 @@ def announce(setup: RunSetup, named: Mapping[str, float], *, is_method_chosen: b
     coarse = coarse_spring(setup.scene.model, setup.scene.grip, method)
     if coarse:
         err.print(
-            f"  the tool has {coarse}: its springs are followed to first order in T only; without "
-            "it, or at a higher --rate, the error falls"
+            f"  the tool has {coarse}: the springs of the scene are followed to first order in T, "
+            "half the error at half the period; without it the tool would be followed to second "
+            "order, a quarter"
         )
     usual = default_method()
     if is_method_chosen and method.name != usual.name:
@@ -152,8 +153,8 @@ def _announce_damping(setup: RunSetup, named: Mapping[str, float]) -> None:
         least = getattr(setup.attainable, name)
         if name in named and named[name] < least * (1.0 - 1e-9):
             err.print(
-                f"  requested {symbol} = {named[name]:g} {unit}: method {setup.method.name} has "
-                f"at least {least:.4g} at this stiffness and rate"
+                f"  {symbol} = {named[name]:g} {unit} is less than the {least:.4g} that method "
+                f"{setup.method.name} shows at this stiffness and rate"
             )
 
 

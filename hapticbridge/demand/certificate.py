@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
-from hapticbridge.coupling import Coupling
+from hapticbridge.coupling import Axis, Coupling
 from hapticbridge.demand.loop_setting import (
     IN_TIME,
-    Axis,
     LoopSetting,
     assumed_lag,
     device_period,
@@ -310,7 +309,7 @@ class DampingCondition:
             text = f"{text} in its own loop of {period}, with {format_si(self.delay or 0.0, 's')} "
             text += "from a position to its force"
         elif self.delay is None:
-            text = f"{text}, if it answers without delay, which is unknown"
+            text = text.replace(": ", ": its delay is unknown; without one, ", 1)
         elif self.delay:
             text = f"{text} with its delay of {format_si(self.delay, 's')}"
         text += self.clause
@@ -342,7 +341,7 @@ def _condition(loop: LoopSetting, axis: Axis, available: float | None) -> Dampin
     if available is not None and available < needed:
         remedy = _remedy(loop, axis, available)
     unconfirmed, lag = None, assumed_lag(loop.info, loop.period)
-    if lag != loop.lag:
+    if lag != loop.lag and loop.info.delay is not None:
         bears = available is not None and available >= loop.needed(axis, lag)
         unconfirmed = lag.delay if bears else loop.lag.delay
     return DampingCondition(
@@ -388,9 +387,9 @@ def _steps(loop: LoopSetting) -> StepCondition | None:
 def _both_lowered(loop: LoopSetting, axis: Axis, share: float) -> str:
     """Returns the words for a share of the law's stiffness and damping, as requested."""
     prefix, spring, damper = _SETTINGS[axis]
-    gains = (share * gain for gain in _gains(loop.requested(loop.law), axis))
+    gains = (share * gain for gain in loop.requested(loop.law).gains(axis))
     k, b = (_three_digits(gain) for gain in gains)
-    both = f" and the damping to {b} {damper}" if _gains(loop.law, axis)[1] > 0.0 else ""
+    both = f" and the damping to {b} {damper}" if loop.law.gains(axis)[1] > 0.0 else ""
     return f"lower the {prefix}stiffness to {k} {spring}{both}"
 
 
@@ -413,7 +412,7 @@ def _remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
     is_rate_free = math.isclose(loop.h * loop.law_evaluations, loop.period)
     parts += ("period",) if is_rate_free and loop.lag == IN_TIME else ()
     share = {part: _largest(partial(_bears, loop, axis, available, part)) for part in parts}
-    stiffness, damping = _gains(_requested(loop), axis)
+    stiffness, damping = _requested(loop).gains(axis)
     remedies = []
     if share["stiffness"]:
         limit = _three_digits(share["stiffness"] * stiffness)
@@ -441,10 +440,10 @@ def _late_remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
     stiffness, damping = stiffest_late_coupling(
         available / loop.ratio(axis), loop.period, lag.delay, lag.ticks_per_sample
     )
-    softer = min(1.0, _gains(loop.law, axis)[0] / stiffness)
+    softer = min(1.0, loop.law.gains(axis)[0] / stiffness)
     at = prefix.replace(" ", "_")
     gains = {f"{at}stiffness": softer * stiffness, f"{at}damping": softer * damping}
-    k, b = _gains(loop.requested(replace(loop.law, **gains)), axis)
+    k, b = loop.requested(replace(loop.law, **gains)).gains(axis)
     told = (
         f"set the {prefix}stiffness to {_three_digits(k)} {spring} and the {prefix}damping to "
         f"{_three_digits(b)} {damper}"
@@ -454,15 +453,9 @@ def _late_remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
     return told
 
 
-def _gains(coupling: Coupling, axis: Axis) -> tuple[float, float]:
-    if axis == "translation":
-        return coupling.stiffness, coupling.damping
-    return coupling.rotational_stiffness, coupling.rotational_damping
-
-
 def _is_hidden(loop: LoopSetting, axis: Axis) -> bool:
     """Returns True if the method took off all requested damping, which may have had any value."""
-    return loop.method.compensated_share > 0.0 and _gains(loop.law, axis)[1] == 0.0
+    return loop.method.compensated_share > 0.0 and loop.law.gains(axis)[1] == 0.0
 
 
 def _requested(loop: LoopSetting) -> Coupling:

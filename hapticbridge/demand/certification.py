@@ -147,9 +147,10 @@ class Certification:
         return (each for each in steps if each.holds is None)
 
     @property
-    def has_open_steps(self) -> bool:
-        """True if it is not known whether friction holds the encoder's steps."""
-        return any(True for _ in self._open_steps)
+    def provisos(self) -> str:
+        """Clause on what a certificate takes for granted; empty if all was measured or stated."""
+        is_open = next(self._open_steps, None) is not None
+        return self._if + (", if its friction holds the encoder's steps" if is_open else "")
 
     @property
     def _cause(self) -> str:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.coupling import Coupling
+from hapticbridge.coupling import Axis, Coupling
 from hapticbridge.demand.methods import IMPLICIT, Method
 from hapticbridge.device.base import DeviceInfo
 from hapticbridge.errors import CouplingError
@@ -17,8 +16,6 @@ from hapticbridge.kernel.ledger import SLACK_SHARE
 from hapticbridge.kernel.parameters import ROUNDING, RunParameters, checked_substeps, whole_ticks
 from hapticbridge.theory.bounds import minimum_damping
 from hapticbridge.theory.transfer import CouplingGrid, delayed_by
-
-Axis = Literal["translation", "rotation"]
 
 # Time in which a device answers
 
@@ -87,11 +84,13 @@ usual rate. A larger value makes the couplings of unmeasured devices softer."""
 def assumed_lag(info: DeviceInfo, period: float) -> Lag:
     """Returns the lag for which a coupling is chosen, with T in s.
 
-    A delay that the device states and no measurement confirms counts as one tick more, at most
-    ``UNCONFIRMED``: links and services take a time that no data sheet has.
+    A delay that no measurement confirms counts as one tick more, at most ``UNCONFIRMED``, and one
+    that the device does not state as this tick: links and services take a time that no data sheet
+    has.
     """
     lag = Lag.of(info, period)
-    if info.delay is None or info.is_delay_measured or info.is_prescribed:
+    is_confirmed = info.is_delay_measured and info.delay is not None
+    if is_confirmed or info.is_prescribed:
         return lag
     return replace(lag, delay=lag.delay + min(period, UNCONFIRMED))
 

@@ -23,9 +23,10 @@ from importlib import import_module
 from typing import Any, Literal
 
 import mujoco
+import numpy as np
 
 from hapticbridge.arguments import Arguments
-from hapticbridge.coupling import Coupling
+from hapticbridge.coupling import Axis, Coupling
 from hapticbridge.device.base import AXES, DeviceInfo
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
 from hapticbridge.kernel.codes import (
@@ -241,6 +242,13 @@ def require_hazard_consent(method: Method, *, is_real: bool, i_know: bool) -> No
 # Coupling of a run under its three names
 
 
+_SYMBOLS: dict[Axis, tuple[str, str, str, str]] = {
+    "translation": ("K", "B", "N/m", "N s/m"),
+    "rotation": ("K_r", "B_r", "N m/rad", "N m s/rad"),
+}
+"""Symbols of stiffness and damping, and their units."""
+
+
 @dataclass(frozen=True, slots=True)
 class RunCoupling:
     """Coupling of a run: as requested, in the law, and effective at the hand.
@@ -335,22 +343,42 @@ class RunCoupling:
 
         A device ``info`` that neither turns nor senses rotation has none on it.
 
-        ``K = 2400 N/m, B = 1.7 N s/m effective (law 0.5, requested 1.7)``. Without an effective
-        coupling the next name comes first.
+        ``K = 2400 N/m, B = 1.7 N s/m (B_law = 0.5)``: B is the effective damping, and the requested
+        one follows where it is another. Without an effective coupling it is the law's or the
+        requested one, which is said.
         """
-        named = {name: getattr(self, name) for name in ("effective", "law", "requested")}
-        named["near contact or held, as here:"] = self.near_contact
-        known = {name: coupling for name, coupling in named.items() if coupling is not None}
-        if not known:
-            return ()
-        first = next(iter(known))
-        notes = [] if self.effective is not None or self.law is None else ["effective unknown"]
+        turns = info is None or {*info.axes, *info.sensed} & {*AXES[3:]}
+        told = (self._sentence(axis) for axis in _SYMBOLS if axis == "translation" or turns)
+        return tuple(filter(None, told))
+
+    def _sentence(self, axis: Axis) -> str:
+        """Returns the sentence on translation or rotation; empty without a spring."""
+        felt, law, asked, near = (
+            None if coupling is None else coupling.gains(axis)
+            for coupling in (self.effective, self.law, self.requested, self.near_contact)
+        )
+        first = felt or law or asked
+        if first is None or first[0] == 0.0:
+            return ""
+        k, b, k_unit, b_unit = _SYMBOLS[axis]
+
+        def other(gains: tuple[float, float], name: str = b) -> str:
+            text = f"{name} = {gains[1]:.4g}"
+            is_equal = math.isclose(gains[0], first[0])
+            return text if is_equal else f"{k} = {format_number(gains[0])}, {text}"
+
+        notes = [other(law, "B_law")] if law and felt else []
+        if asked and (felt or law) and not np.allclose(asked, first, rtol=1e-9, atol=0.0):
+            notes.append(f"asked for {other(asked)}")
+        notes += [f"near contact or held, as here: {other(near)}"] if near else []
+        notes += ["unknown at the hand"] if law and not felt else []
         notes += [self.remark] if self.remark else []
-        return tuple(
-            _sentence(first, known, symbols, notes)
-            for symbols in (_TRANSLATION, _ROTATION)
-            if symbols is _TRANSLATION or info is None or {*info.axes, *info.sensed} & {*AXES[3:]}
-            if getattr(known[first], symbols[0]) > 0
+        beside = f" ({', '.join(notes)})" if notes else ""
+        name = "B_law" if law and not felt else b
+        words = "" if felt or law else " asked for"
+        return (
+            f"{k} = {format_number(first[0])} {k_unit}, "
+            f"{name} = {first[1]:.4g} {b_unit}{words}{beside}"
         )
 
 
@@ -364,29 +392,6 @@ def _acting(law: Coupling, timestep: float, share: float) -> Coupling:
         )
     )
     return replace(law, damping=damping, rotational_damping=rotational)
-
-
-_TRANSLATION = "stiffness", "damping", "K", "B", "N/m", "N s/m"
-_ROTATION = "rotational_stiffness", "rotational_damping", "K_r", "B_r", "N m/rad", "N m s/rad"
-
-
-def _sentence(
-    first: str, known: dict[str, Coupling], symbols: tuple[str, ...], notes: list[str]
-) -> str:
-    spring, damper, k, b, spring_unit, damper_unit = symbols
-    stiffness = getattr(known[first], spring)
-    others = []
-    for name, coupling in known.items():
-        if name != first:
-            other, damping = getattr(coupling, spring), f"{getattr(coupling, damper):.4g}"
-            with_spring = f"{k} = {format_number(other)}, {b} = {damping}"
-            is_equal = math.isclose(other, stiffness)
-            others.append(f"{name} {damping if is_equal else with_spring}")
-    beside = f" ({', '.join([*others, *notes])})" if others or notes else ""
-    return (
-        f"{k} = {format_number(stiffness)} {spring_unit}, "
-        f"{b} = {getattr(known[first], damper):.4g} {damper_unit} {first}{beside}"
-    )
 
 
 # Rendering methods of the product, and the registry of all methods
@@ -412,7 +417,8 @@ COMPENSATED = replace(
 LOSSLESS_COUPLING = Method(
     name="lossless",
     about="half of the coupling inside MuJoCo's implicit step, half carried over from the last: a "
-    "free tool keeps its energy and is followed to second order; near contacts it is 'implicit'",
+    "free tool keeps its energy and is followed to second order, its force comes half a tick late, "
+    "of first order; near contacts it is 'implicit'",
     hazard="",
     scheme=Scheme.MIDPOINT,
     integrator="discrete",

@@ -103,7 +103,7 @@ def alternatives(requested: Coupling, period: float, filter_time: float) -> tupl
     def by_method(method: Method) -> Alternative:
         used = method.law_coupling(requested, period)
         shown = RunCoupling.of(method, period, requested).effective or used
-        name = f"{method.name}: B = {shown.damping:.4g} effective (law {used.damping:.4g})"
+        name = f"{method.name}: B = {shown.damping:.4g} (B_law = {used.damping:.4g})"
         return way(name, law=used)
 
     methods = list(map(by_method, guaranteed_methods().values()))
@@ -194,8 +194,8 @@ def draw_z_width(z: ZWidth, measured: Sequence[tuple[float, float, float]] | Non
     corner = z.corner
     axes.plot(corner.damping, corner.stiffness, "o", color="black", ms=7, label="to be used")
     axes.annotate(
-        f"K = {corner.stiffness:.4g} N/m\nB = {recommended(z).damping:.3g} N s/m effective\n"
-        f"(law {corner.damping:.3g})",
+        f"K = {corner.stiffness:.4g} N/m\nB = {recommended(z).damping:.3g} N s/m\n"
+        f"(B_law = {corner.damping:.3g})",
         (corner.damping, corner.stiffness),
         xytext=(0, -10),
         textcoords="offset points",

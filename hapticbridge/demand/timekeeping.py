@@ -138,7 +138,7 @@ class Alarm(StrEnum):
     @property
     def words(self) -> str:
         """Name of the finding in a clause."""
-        return "its force came late, reversed or in steps"
+        return "its force came late, reversed or in steps, or the hand shook it faster than 8 Hz"
 
     @property
     def sentence(self) -> str:

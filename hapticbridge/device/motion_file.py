@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import codecs
 import os
+import re
 import stat
 import struct
 import warnings
@@ -104,12 +106,16 @@ def _read_lines(path: Path) -> list[str]:
         if not stat.S_ISREG(mode):
             kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
             raise DeviceError(f"{path}: is {kind}, not a CSV file")
-        return path.read_text(encoding="utf-8-sig").split("\n")
+        # a spreadsheet's "Unicode text" is UTF-16, and begins with its byte-order mark
+        with path.open("rb") as file:
+            is_wide = file.read(2) in {codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE}
+        return path.read_text(encoding="utf-16" if is_wide else "utf-8-sig").split("\n")
     except FileNotFoundError:
         raise DeviceError(f"{path}: no such file") from None
     except UnicodeDecodeError as error:
         line = path.read_bytes()[: error.start].count(b"\n") + 1
-        raise DeviceError(f"{path}, line {line}: not UTF-8 text, so not a CSV file") from None
+        kind = "-".join(error.encoding.upper().split("-")[:2])
+        raise DeviceError(f"{path}, line {line}: not {kind} text, so not a CSV file") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise DeviceError(f"{path}: cannot be read ({reason})") from None
@@ -123,6 +129,11 @@ def _column_names(where: str, line: str) -> list[str]:
     if all(_is_number(name) for name in names):
         raise DeviceError(f"{where}: numbers where {needed}")
     known = TIME_AND_POSITION + ORIENTATION
+    if len(names) == 1 and re.search(r"[\s|]", names[0]):
+        raise DeviceError(
+            f"{where}: the columns in {line.strip()!r:.40} are not separated by commas, semicolons "
+            f"or tabs; {needed}"
+        )
     if set(EXPORTED) <= set(names):
         own = dict(zip(EXPORTED, known, strict=True))
         return [own.get(name, "") for name in names]
@@ -277,7 +288,9 @@ def read_bag(path: Path, topic: str = "") -> Motion:
             has_chunks = (index := _index(file)) is not None and index.chunk_indexes
             make = make_reader if has_chunks else NonSeekingReader
             reader = make(file, validate_crcs=True)
-            for _, _, message in reader.iter_messages([topic], log_time_order=False):
+            for _, channel, message in reader.iter_messages([topic], log_time_order=False):
+                if (encoding := channel.message_encoding) != _CDR:
+                    raise ValueError(f"its encoding is {encoding!r:.40}, not '{_CDR}'")
                 stamp, pose = _pose_of(message.data)
                 stamps.append(stamp)
                 logged.append(message.log_time)
@@ -352,15 +365,32 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 """Start of what Zstandard compressed, as bags of compression mode ``message`` hold."""
 
 
+_CDR = "cdr"
+"""Encoding of messages in bags of ROS 2, as MCAP names it."""
+
+_ALIGNED_TO = {0x0000: 8, 0x0001: 8, 0x0006: 4, 0x0007: 4}
+"""Largest alignment in bytes by the representation of a message: plain CDR of versions 1 and 2."""
+
+
 def _pose_of(data: bytes) -> tuple[int, tuple[float, ...]]:
     """Returns stamp in ns and numbers of a ``PoseStamped``: x, y, z in m, then qx, qy, qz, qw.
 
-    It is CDR: two bytes of the encoding, whose last bit says little-endian, two of options; then
-    the stamp, the length of the frame's name and the name, and the numbers at a multiple of 8.
+    It is CDR: two bytes of the representation, whose last bit says little-endian, two of options;
+    then the stamp, the length of the frame's name and the name, and the numbers at a multiple of 8
+    bytes, or of 4 in version 2 (OMG DDS-XTypes 1.3, 7.4).
+
+    Raises:
+        ValueError: The representation is none of these.
     """
     if data.startswith(_ZSTD):
         raise ValueError("the bag compresses each message; 'ros2 bag convert' undoes it")
-    order = "<" if data[1] & 1 else ">"
+    (representation,) = struct.unpack_from(">H", data)
+    if representation not in _ALIGNED_TO:
+        raise ValueError(
+            f"its representation is 0x{representation:04x}; of CDR, 0x0000, 0x0001, 0x0006 and "
+            "0x0007 are read"
+        )
+    order, size = "<" if representation & 1 else ">", _ALIGNED_TO[representation]
     seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
-    start = 4 + (12 + length + 7) // 8 * 8
+    start = 4 + (12 + length + size - 1) // size * size
     return seconds * 10**9 + nanoseconds, struct.unpack_from(f"{order}7d", data, start)

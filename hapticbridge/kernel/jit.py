@@ -24,6 +24,7 @@ import mujoco
 import numpy as np
 import platformdirs
 
+from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel import machine_code
 
 _Function = TypeVar("_Function", bound=Callable[..., object])
@@ -273,9 +274,9 @@ class Compiled(Deferred):
     @cached_property
     def _part(self) -> Any:
         """The function as a part of a program that is compiled as a whole."""
-        return import_module("numba").njit(
-            error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
-        )(self._function)
+        return _numba().njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(
+            self._function
+        )
 
     @property
     def _numba_type_(self) -> Any:
@@ -284,7 +285,7 @@ class Compiled(Deferred):
         return (self._part if is_part else self.built)._numba_type_
 
     def _decorated(self) -> Any:
-        numba = import_module("numba")
+        numba = _numba()
         decorate = partial(numba.njit, nogil=self._nogil, error_model="numpy")
         folder = cache_folder()
         if folder is None:
@@ -300,6 +301,20 @@ class Compiled(Deferred):
         # where it cannot write, numba turns to folders beside the sources and of other programs
         is_ours = Path(function.stats.cache_path).is_relative_to(own)
         return function if is_ours else decorate()(self._function)
+
+
+def _numba() -> Any:
+    """Imports numba.
+
+    Raises:
+        HapticBridgeError: The user disabled its compiler.
+    """
+    numba = import_module("numba")
+    if numba.config.DISABLE_JIT:
+        raise HapticBridgeError(
+            "NUMBA_DISABLE_JIT is set, and a tick calls MuJoCo from compiled code alone; unset it"
+        )
+    return numba
 
 
 def examples(c_types: tuple[str, ...]) -> tuple[object, ...]:

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
-from typing import Any, Literal
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -29,7 +29,7 @@ from hapticbridge.arguments import (
     shared,
     shown,
 )
-from hapticbridge.coupling import Coupling
+from hapticbridge.coupling import Axis, Coupling
 from hapticbridge.demand.certificate import StepCondition, assumed_damping
 from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.loop_setting import IN_TIME, LoopSetting
@@ -224,7 +224,7 @@ class AxisCouplingLimits:
             ``certificate.assumed_damping``.
     """
 
-    axis: Literal["translation", "rotation"]
+    axis: Axis
     run: CouplingLimits
 
     @property

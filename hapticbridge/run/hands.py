@@ -94,11 +94,11 @@ class Grasp:
         grip: Site that the hand holds; or BODY, at its centre of mass; or BODY@x,y,z, a point in m
             in the body's frame; or joint:NAME. If the scene has none of that name, the most
             plausible ones are listed. Several hands differ, and the first holds no joint.
-        device: 'simulated' (in the scene's own hand), 'simulated:damping=5,hand_mass=1',
-            'trajectory:FILE' (CSV or recording), 'mouse' (drag the handle in the view, which it
-            shows by itself), or a device from the list of 'hapticbridge devices'. In code an open
-            device, too. A simulated one of several follows SCENE_GRIP.csv beside the scene, if
-            there is such a file.
+        device: 'simulated' (in the scene's own hand; 'simulated:damping=5,path=hand.csv' leads it
+            along a file), 'trajectory:FILE' (CSV or recording), 'mouse' (drag the handle in the
+            view, which it shows by itself), or a device from the list of 'hapticbridge devices'. In
+            code an open device, too. A simulated one of several follows SCENE_GRIP.csv beside the
+            scene, if there is such a file.
         coupling: As for ``Bridge``, for this hand.
         workspace: Map from this device's frame to the scene's; None takes that of the options.
         limits: Limits of this hand; None takes those of the options.

@@ -347,16 +347,17 @@ class Summary:
         if self.certification.standing is Standing.NO_HAND:
             return "passive: the scene gave out no more energy than it got"
         if self.is_certified:
+            if not method_named(self.method).has_guarantee:
+                return f"passive this time; method {self.method} guarantees no other hand anything"
             more = f", and {format_energy(self.credit)}" if self.credit else ""
-            if self.certification.has_open_steps:
-                more += ", if its friction holds the encoder's steps"
+            more += self.certification.provisos
             more += ", apart from what motors and inputs gave" if self.hand_energy.limit else ""
             return (
-                "passive, and certified: no hand gets more energy than it puts in or the scene "
-                f"had stored{more}"
+                "passive, and certified: on the device as stated no hand gets more than it puts in "
+                f"or the scene had stored{more}"
             )
         judged = "not certified" if self.is_certified is False else "not judged"
-        return f"passive this time, but {judged}: another hand may get energy out of it"
+        return f"the scene was passive, the device is {judged}: a hand may get energy out of it"
 
     def _lines(self) -> Iterator[str]:
         yield self.headline
@@ -460,9 +461,10 @@ class Summary:
             yield f"device not certified: {certification.reason}"
             return
         yield certification.words
-        if not certification.verdict and certification.standing is not Standing.NO_HAND:
-            yield from self.conditions
-        if certification.verdict is False and method_named(self.method).has_law:
+        if certification.verdict or certification.standing is Standing.NO_HAND:
+            return
+        yield from self.conditions
+        if method_named(self.method).has_law:
             yield "only --energy-limit bounds what the hand gets"
 
     @property

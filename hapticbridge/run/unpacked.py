@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 
 from hapticbridge.confinement import MEMORY
@@ -38,7 +38,7 @@ def unpack_scene(recording: Path, files: Mapping[str, bytes], folder: Path) -> P
     """
     main: Path | None = None
     sources = {
-        name: (PurePosixPath(name.removeprefix(SOURCE_PREFIX)), data)
+        name: (PurePath(name.removeprefix(SOURCE_PREFIX)), data)
         for name, data in files.items()
         if name.startswith(SOURCE_PREFIX)
     }
@@ -51,7 +51,7 @@ def unpack_scene(recording: Path, files: Mapping[str, bytes], folder: Path) -> P
     folder = folder.joinpath(*MAX_STEPS * max(climbs, default=0) * ["inner"])
     for name, (inner, data) in sources.items():
         # a foreign recording must not write outside the folder
-        if inner.is_absolute() or ".." in inner.parts or "\\" in name or ":" in name:
+        if inner.anchor or ".." in inner.parts:
             raise RecordingError(
                 f"the attachment {name!r:.80} would lie outside the scene's folder"
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -449,7 +450,7 @@ def _refused(path: Path) -> Iterator[None]:
 
 def _found_nowhere(path: Path, error: Exception) -> str:
     """Returns MuJoCo's words; of a file that it does not find, with the folder it looked in."""
-    if str(error).startswith("Error: Error opening file"):  # MuJoCo's own
+    if found := re.match("Error: Error opening file '(.*)'", str(error)):  # MuJoCo's own
         places = f"'{path.resolve().parent}' and its meshdir or texturedir, if it names one"
         with suppress(OSError):
             if "'package:" in str(error):
@@ -457,10 +458,12 @@ def _found_nowhere(path: Path, error: Exception) -> str:
                     '; MuJoCo resolves no package://, but <mujoco><compiler strippath="true" '
                     'meshdir="FOLDER"/></mujoco> in <robot> finds the bare names in FOLDER'
                 )
-            elif b"<include" in path.read_bytes():
+            elif b"<include" in path.read_bytes():  # a part's names are told as absolute paths
                 places += (
                     '; for the files of a part <compiler meshdir="FOLDER"/> behind its <include> '
                     "counts, with FOLDER seen from here"
                 )
+            elif re.match(r"[/\\]|\w:[/\\]", found[1]):
+                return f"{clause(error)}, an absolute path; write it relative to the scene's file"
         return f"{clause(error)}, looked for in {places}"
     return clause(error)

@@ -215,6 +215,8 @@ class _Home:
             tag = _TAG.match(text, text.rfind("<", 0, match.start()) + 1)
             home, file = self.of(tag[0] if tag else ""), _key(self.folder / name)
             inner = os.path.relpath(file, _key(home)) if file.is_relative_to(root) else ""
+            if ":" in _parts(inner)[0]:  # on Linux a letter of a name, and no drive
+                inner = f"./{inner}"
             yield match.span(group), name, inner
 
 

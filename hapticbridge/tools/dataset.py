@@ -36,6 +36,8 @@ from hapticbridge.kernel.record import force_on_hand
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.ros_messages import axes_of
 from hapticbridge.replay.film import Shot, states
+from hapticbridge.run.description import meta_float
+from hapticbridge.tools.export import time_of
 
 POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
@@ -110,9 +112,11 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
         SENSORS: tuple(found["sensor_names"]),
         ACTION: (*POSE, *WRENCH),
     }
-    for column in (CTRL, SENSORS):
-        if not names[column]:
-            del values[column], names[column]
+    left_out = [column for column in (CTRL, SENSORS) if not names[column]]
+    if meta_float(recording.meta, "credit") > 0.0:  # the scene is the shown tool alone
+        left_out.append(QPOS)
+    for column in left_out:
+        del values[column], names[column]
     return Episode(
         name=name,
         scene=recording.meta.get("scene", ""),
@@ -187,7 +191,7 @@ class LeRobotWriter:
             self._numbers.setdefault(name, []).append(values)
         looked = np.zeros((0, 3))
         if episode.pictures:
-            key = f"observation.images.{self._shot.camera}"
+            key = f"observation.images.{_label(self._shot)}"
             pictures = [
                 {"bytes": data, "path": f"frame-{frame:06d}.png"}
                 for frame, data in enumerate(episode.pictures)
@@ -266,7 +270,7 @@ class LeRobotWriter:
         }
         if episode.pictures:
             shape = [self._shot.height, self._shot.width, 3]
-            features[f"observation.images.{self._shot.camera}"] = {
+            features[f"observation.images.{_label(self._shot)}"] = {
                 "dtype": "image",
                 "shape": shape,
                 "names": ["height", "width", "channels"],
@@ -280,6 +284,14 @@ class LeRobotWriter:
         path = self._folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         self._parquet.write_table(self._arrow.table(dict(columns)), path)
+
+
+def _label(shot: Shot) -> str:
+    """Returns the camera's name without '/'.
+
+    LeRobot refuses a feature with it, and robomimic would meet a group of HDF5 in place of numbers.
+    """
+    return str(shot.camera).replace("/", "_")
 
 
 def _statistics(values: NDArray[Any], count: int) -> dict[str, Any]:
@@ -362,7 +374,7 @@ class RobomimicWriter:
             if name in episode.values
         }
         if episode.pictures:
-            observed[f"{self._shot.camera}_image"] = _frames(episode.pictures)
+            observed[f"{_label(self._shot)}_image"] = _frames(episode.pictures)
         for name, values in observed.items():
             demo[f"obs/{name}"] = values
             demo[f"next_obs/{name}"] = np.concatenate([values[1:], values[-1:]])
@@ -412,10 +424,12 @@ class WrittenDataset:
     Attributes:
         folder: The data set.
         episodes: Number of frames of each episode.
+        resets: Times in s within each episode at which the scene was reset, so that it jumps.
     """
 
     folder: Path
     episodes: tuple[int, ...]
+    resets: tuple[tuple[float, ...], ...]
 
 
 def write_dataset(
@@ -468,7 +482,16 @@ def write_dataset(
         raise RecordingError(f"cannot write '{folder}': {reason_of(error, folder)}") from None
     finally:
         shutil.rmtree(draft, ignore_errors=True)
-    return WrittenDataset(folder, tuple(counts))
+    return WrittenDataset(folder, tuple(counts), tuple(map(_resets, recordings)))
+
+
+def _resets(recording: RecordingFile) -> tuple[float, ...]:
+    """Returns the times in s of the resets of a run; its tool is placed in the first two ticks."""
+    return tuple(
+        time_of(event)
+        for event in recording.events
+        if event.get("event") == "reset" and event.get("tick", 0) > 1
+    )
 
 
 def _sound(recording: RecordingFile) -> RecordingFile:

@@ -63,8 +63,8 @@ _ROUNDING = 1.0 + 1e-9  # restores 2 from a bound that was computed as 1.9999999
 
 SYMBOLS = {"translation": ("K", "B"), "rotation": ("K_r", "B_r")}
 _WORDS = {
-    "translation": ("stiffness", "requested damping"),
-    "rotation": ("turning stiffness", "requested turning damping"),
+    "translation": ("stiffness", "damping"),
+    "rotation": ("turning stiffness", "turning damping"),
 }
 
 

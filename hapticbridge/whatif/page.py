@@ -44,17 +44,20 @@ if TYPE_CHECKING:
 
 Row = tuple[str, tuple[str, ...]]
 
+COUPLINGS = {"effective": "K, B", "law": "K, B_law", "requested": "K, B asked for"}
+"""Titles of the couplings of a run."""
+
 
 def rows(what_if: WhatIf) -> Iterator[Row]:
     """Yields a name and a text per run, in the order of its runs."""
     runs, reports = what_if.runs, [run.report for run in what_if.runs]
     for hand, grip in enumerate(runs[0].report.hands or ("",)):
         of_hand = [_coupling(run, hand) for run in runs]
-        for name in ("effective", "law", "requested"):
+        for name, title in COUPLINGS.items():
             couplings = [getattr(each, name, None) for each in of_hand]
             if any(couplings):
                 yield (
-                    f"{name} K, B" + (f" at '{grip}'" if grip else ""),
+                    title + (f" at '{grip}'" if grip else ""),
                     tuple(
                         f"{format_number(c.stiffness)} N/m, {c.damping:.4g} N s/m"
                         if c

@@ -86,10 +86,13 @@ class WebSocketLink:
             local_socket = socket.create_connection((host, port), OPEN_TIMEOUT)
         except (socket.gaierror, UnicodeError):
             raise DeviceError(f"there is no host '{host}' for {name}") from None
-        except (OSError, OverflowError):
+        except (OSError, OverflowError) as error:
+            is_there = isinstance(error, ConnectionRefusedError)
+            state = "does not run" if is_there else "cannot be reached"
+            reason = "no answer" if is_there else getattr(error, "strerror", None) or error
             raise DeviceError(
-                f"{name} does not run: no answer at {host}:{port}; start it, or name its address "
-                "with service=HOST:PORT"
+                f"{name} {state}: {reason} at {host}:{port}; start it, or name its address with "
+                "service=HOST:PORT"
             ) from None
         try:
             local_socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
