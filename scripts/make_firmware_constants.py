@@ -21,6 +21,7 @@ def header() -> str:
         "HB_VERSION": protocol.VERSION,
         "HB_LONGEST_WATCHDOG_MS": protocol.MAX_WATCHDOG_MS,
         **{f"HB_KIND_{kind.name}": int(kind) for kind in protocol.Kind},
+        **{f"HB_CAUSE_{cause.name}": int(cause) for cause in protocol.Cause},
         "HB_OPTION_ENABLE": protocol.ENABLE,
         "HB_OPTION_HAS_VELOCITY": protocol.HAS_VELOCITY,
         "HB_OPTION_IS_PLACED": protocol.IS_PLACED,
@@ -30,6 +31,7 @@ def header() -> str:
     }
     reals = {"HB_NEAR": shown_tool.NEAR, "HB_SLOWEST": shown_tool.SLOWEST}
     reals["HB_LONGEST"] = shown_tool.LONGEST
+    reals |= {"HB_SPEED_STEP": protocol.SPEED_STEP, "HB_TURN_STEP": protocol.TURN_STEP}
     lines = [f"static const int {name} = {value};" for name, value in numbers.items()]
     lines += [f"static const float {name} = {value!r}f;" for name, value in reals.items()]
     return "\n".join(

@@ -23,34 +23,49 @@ void finish();
 uint32_t clock_now();
 float instructions_per_count();
 
-void say_number(const char* name, uint32_t value) {
+void say_number(const char* loop, const char* name, uint32_t value) {
   char text[11];
   for (int k = 9; k >= 0; k--, value /= 10u) text[k] = (char)('0' + value % 10u);
   text[10] = 0;
+  say(loop);
   say(name);
   say(text);
   say("\n");
 }
 
-void run() {
-  HbLoop loop(1e-4f);
+template <bool TURNS>
+void run(const char* name) {
+  HbLoopOf<TURNS> loop(1e-4f);
   HbSetting setting;
   memset(&setting, 0, sizeof setting);
   setting.gains.stiffness = 20000.0f;
   setting.gains.damping = 0.5f;
   setting.gains.level = 5.0f;
+  setting.turn_gains.stiffness = 10.0f;
+  setting.turn_gains.damping = 1e-4f;
+  setting.turn_gains.level = 0.1f;
   setting.credit = 10000000000LL;
   setting.fade = 0.01f;
   setting.patience = 0.05f;
   setting.is_enabled = true;
   loop.set(setting);
   float hand[3] = {0.0f, 0.0f, 0.0f}, velocity[3] = {0.0f, 0.0f, 0.0f}, force[3];
+  float rotation[4] = {1.0f, 0.0f, 0.0f, 0.0f}, turning[3] = {0.0f, 0.0f, 0.0f};
+  float torque[3] = {0.0f, 0.0f, 0.0f};
   uint32_t sum = 2166136261u, largest = 0, total = 0;
   HbEnergy work = 0;
   for (int tick = 0; tick < 5000; tick++) {
     for (int i = 0; i < 3; i++) {
       velocity[i] += 0.005f * draw() - 0.01f * velocity[i];
       hand[i] += 1e-4f * velocity[i];
+    }
+    if (TURNS) {
+      float turn[3];
+      for (int i = 0; i < 3; i++) {
+        turning[i] += 0.1f * draw() - 0.01f * turning[i];
+        turn[i] = 1e-4f * turning[i];
+      }
+      hb_turned(turn, rotation, rotation);
     }
     if (tick % 20 == 0) {
       HbShown shown;
@@ -65,25 +80,38 @@ void run() {
           shown.plane[i].gap = 1e-5f + 1e-5f * draw();
         }
       }
+      if (TURNS) {
+        float turn[3];
+        for (int i = 0; i < 3; i++) {
+          turn[i] = (tick % 100 == 0 ? 3.0f : 5e-3f) * draw();
+          shown.turning[i] = turning[i] + 0.5f * draw();
+        }
+        hb_turned(turn, rotation, shown.rotation);
+      }
       work += 1000000;
       shown.work = work;
       loop.show(shown, false);
     }
     const uint32_t before = clock_now();
-    loop.tick(hand, force);
+    loop.tick(hand, rotation, force, torque);
     const uint32_t taken = clock_now() - before;
     total += taken;
     if (taken > largest) largest = taken;
-    for (int i = 0; i < 3; i++) sum = mixed(sum, force[i]);
+    for (int i = 0; i < 3; i++) sum = mixed(mixed(sum, force[i]), torque[i]);
     sum = mixed(sum, (float)loop.report().tank);
   }
-  say_number("bits ", sum);
-  say_number("held back ", loop.report().held_back);
+  say_number(name, "bits ", sum);
+  say_number(name, "held back ", loop.report().held_back);
   const float each = instructions_per_count();
   if (each > 0.0f) {
-    say_number("instructions, mean ", (uint32_t)((float)total / 5000.0f * each));
-    say_number("instructions, most ", (uint32_t)((float)largest * each));
+    say_number(name, "instructions, mean ", (uint32_t)((float)total / 5000.0f * each));
+    say_number(name, "instructions, most ", (uint32_t)((float)largest * each));
   }
+}
+
+void run_both() {
+  run<false>("lines: ");
+  run<true>("poses: ");
 }
 
 #ifdef __arm__
@@ -138,7 +166,7 @@ void start() {
   __asm__ volatile("dsb\n isb");
   SYSTEM_TIMER[1] = 0xFFFFFFu;
   SYSTEM_TIMER[0] = 5u;
-  run();
+  run_both();
   finish();
   for (;;) {
   }
@@ -152,7 +180,7 @@ __attribute__((section(".vectors"), used)) const void* const VECTORS[2] = {&stac
 #else
 
 int main() {
-  run();
+  run_both();
   finish();
 }
 

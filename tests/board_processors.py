@@ -13,8 +13,9 @@ from firmware_build import COMPILER, FIRMWARE
 
 HERE = Path(__file__).parent
 
-MOST = 2500
-"""Instructions of a period with three axes, of the 15 000 that 10 kHz leaves at 150 MHz."""
+MOST = {"lines": 2500, "poses": 10_000}
+"""Instructions of a period with three axes and with six, of the 15 000 that 10 kHz leaves at
+150 MHz."""
 
 TOOLS = ("arm-none-eabi-g++", "arm-none-eabi-size", "qemu-system-arm")
 PACKAGES = (
@@ -70,8 +71,8 @@ def computed_here(folder: Path) -> dict[str, int]:
     return _counts(_printed(target))
 
 
-def _cross_compiled(core: str, folder: Path, *sources: Path) -> Path:
-    own, target = CORES[core], folder / f"{sources[0].stem}-{core}"
+def _cross_compiled(core: str, folder: Path, *sources: Path | str) -> Path:
+    own, target = CORES[core], folder / f"{Path(sources[0]).stem}-{core}"
     _printed(
         "arm-none-eabi-g++", *FLAGS, "-fno-exceptions", "-fno-rtti", "-fno-threadsafe-statics",
         "-ffunction-sections", "-nostartfiles", "-Wl,--gc-sections,-e,start", f"-mcpu={core}",
@@ -92,12 +93,14 @@ def computed_on(core: str, folder: Path) -> dict[str, int]:
     )  # fmt: skip
 
 
-def memory_on(core: str, folder: Path) -> tuple[int, int]:
+def memory_on(core: str, folder: Path, loop: str) -> tuple[int, int]:
     """Returns the bytes of flash and of memory, the stack apart, that a board's firmware takes.
 
-    It is what the headers and ``hb_protocol.cpp`` add to the core of an Arduino.
+    It is what the headers and ``hb_protocol.cpp`` add to the core of an Arduino. ``loop`` is one of
+    ``MOST``.
     """
-    sources = HERE / "board_firmware.cpp", FIRMWARE / "hb_protocol.cpp"
+    define = "-DHB_SKETCH_POSE" if loop == "poses" else "-DHB_SKETCH_LINES"
+    sources = HERE / "board_firmware.cpp", FIRMWARE / "hb_protocol.cpp", define
     text, data, bss = (
         _printed("arm-none-eabi-size", _cross_compiled(core, folder, *sources))
         .splitlines()[1]

@@ -499,3 +499,82 @@ def test_what_the_sketch_does_with_interrupts_off_keeps_them_off(sketch: ctypes.
     sketch.sketch_run(1_010 * 3 + 10, 1)
     assert sketch.sketch_sections() == 10  # a force frame, and three for each of three states
     assert sketch.sketch_broken_sections() == 0
+
+
+ARM = """#define HB_SKETCH_POSE
+#include "hb_sketch.h"
+
+static HbSheet my_sheet() {
+  HbSheet sheet = hb_unknown_sheet();
+  sheet.name = "arm";
+  sheet.axes = HB_X | HB_Y | HB_Z | HB_RX | HB_RY | HB_RZ;
+  sheet.rate = 495.0f;
+  sheet.force_limit = 5.0f;
+  sheet.torque_limit = 0.3f;
+  sheet.speed_limit = 2.0f;
+  sheet.loop_delay = 1e-5f;
+  return sheet;
+}
+
+void read_pose(float position[3], float rotation[4]) {
+  const float turn[3] = {0.0f, 0.0f, 1e-4f * (float)encoder_count};
+  position[0] = 1e-6f * (float)encoder_count;
+  hb_turned(turn, rotation, rotation);
+}
+
+void write_wrench(const float force[3], const float torque[3]) {
+  analogWrite(1, (int)(1e3f * force[0]));
+  analogWrite(2, (int)(1e6f * torque[2]));
+}
+
+HbSketch device(my_sheet(), 100);
+
+void control_tick() { device.tick(); }
+
+void setup() { device.start(control_tick); }
+
+void loop() {
+  uint8_t frame[HB_FRAME_BYTES];
+  while (RawHID.recv(frame, 0) > 0) {
+    device.receive(frame);
+    if (device.answer(frame)) RawHID.send(frame, 100);
+  }
+  if (device.state(0, 0, frame)) RawHID.send(frame, 0);
+  if (device.more(frame)) RawHID.send(frame, 0);
+}
+"""
+
+
+def test_the_sketch_of_an_arm_tells_and_renders_its_rotation(tmp_path: Path) -> None:
+    (tmp_path / "arm.ino").write_text(ARM)
+    built(tmp_path, f'-DSKETCH="{tmp_path / "arm.ino"}"', "-DTEENSYDUINO")
+    sketch = switched_on(tmp_path / LIBRARY, tmp_path / "arm.so")
+    for count in range(100):  # at 1 rad/s
+        sketch.sketch_turn(50 * count)
+        sketch.sketch_run(5_000, 1)
+    last = states_of(sketch)[-1]
+    assert last.numbers[5] == pytest.approx(0.495, rel=1e-5)
+    assert last.numbers[0] == pytest.approx(4950e-6, rel=1e-5)
+    sketch.sketch_send(protocol.ask_frame(1, 0))
+    sketch.sketch_send(protocol.setting_frame(1, BoardSetting(0, 0, 0, 0, 0.01, 1e-3, 5.0, 0, 0.3)))
+    for sequence in range(2, 12):
+        tool = ShownTool((0.00495, 0.0, 0.0), (0.0,) * 3, rotation=(0.0, 0.0, 0.495))
+        sketch.sketch_send(protocol.show_frames(sequence, tool, 50, is_posed=True)[0])
+        sketch.sketch_turn(4950 - 10 * (sequence - 2))
+        sketch.sketch_run(10_000, 1)
+    assert sketch.sketch_pin(2) == pytest.approx(5.0 * 9e-3 * 1e6, rel=0.01)
+    assert sketch.sketch_pin(1) == 0
+    frame, told = ctypes.create_string_buffer(64), []
+    while sketch.sketch_fetch(frame):
+        told.append(protocol.decoded(frame.raw))
+    (sheet,) = (each for each in told if isinstance(each, protocol.Numbers))
+    assert sheet.is_posed
+    at = [k for k, each in enumerate(told) if isinstance(each, LoopState)]
+    assert all(isinstance(told[k + 1], protocol.LoopTurn) for k in at[:-1])
+    assert len(at) > 40
+    half = told[at[-2] + 1]
+    assert isinstance(half, protocol.LoopTurn)
+    assert half.rotation[2] == pytest.approx(0.486, abs=1e-5)
+    assert half.torque[2] == pytest.approx(0.045, rel=0.01)
+    sketch.sketch_run(100_000, 0)  # loop() hangs: its interrupt lets go after the patience
+    assert sketch.sketch_pin(2) == 0

@@ -75,11 +75,11 @@ def test_a_tap_on_the_firmwares_loop_has_the_force_of_the_chart(
     own, period = Loop("board", rate), 1.0 / rate
     law = own.coupling(DEVICE)
     library = built_loop(tmp_path)
-    board = ctypes.c_void_p(library.loop_new(ctypes.c_float(period)))
-    # K, B', level, credit, energy under way, fade, patience
-    setting = [law.stiffness, 0.0, 20.0, 0.0, 1.0, period, 1.0]
+    board = ctypes.c_void_p(library.loop_new(ctypes.c_float(period), 0))
+    # K, B', level, credit, energy under way, fade, patience, and gains of rotations
+    setting = [law.stiffness, 0.0, 20.0, 0.0, 1.0, period, 1.0, 0.0, 0.0, 0.0]
     library.loop_set(board, floats(setting), 1)
-    shown = [0.0] * 6 + [1.0, 0.0, 0.0, 0.0] + [0.0] * 8
+    shown = [0.0] * 13 + [1.0, 0.0, 0.0, 0.0] + [0.0] * 8
     library.loop_show(board, floats(shown), ctypes.c_double(0.0), 1, 1, 0)
     force = np.zeros(3, np.float32)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,18 +12,23 @@ from typing import Any
 import numpy as np
 import pytest
 from board_attack import built_loop
-from emulated.board_model import BoardSheet, LoopBoard
+from cli_cases import Called, facts_of
+from emulated.board_model import POSE, BoardSheet, LoopBoard
 from emulated.hid_seam import DrivingClock, HidSeam
 from firmware_build import COMPILER
 
 import hapticbridge as hb
+from hapticbridge.cli.guide import page
+from hapticbridge.demand.certificate import conditions_of
+from hapticbridge.demand.guard import FADE
 from hapticbridge.demand.own_loop import REPORT_DTYPE, ROUNDING, OwnLoopTally
 from hapticbridge.device import Motion, SimulatedDevice
-from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.own_loop import BoardSetting, LoopReport, LoopState, ShownTool
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
 from hapticbridge.device.simulated.device import hand_for
-from hapticbridge.errors import DeviceError
+from hapticbridge.device.watchdog import watchdog_time
+from hapticbridge.errors import DeviceError, SafetyTrip
+from hapticbridge.kernel.pose import product, quaternion_exp, rotation_between
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.run.commands import Couple, Reset, Switch
 from hapticbridge.run.own_loop import OwnLoop
@@ -45,21 +52,28 @@ class Bench:
         scene: str = "virtual_wall",
         sheet: BoardSheet | None = None,
         link: float = 0.5e-3,
+        path: str | Motion | None = None,
         **options: object,
     ) -> None:
         self.scene, own = hb.load_scene(scene), sheet or BoardSheet()
         hand = hand_for(self.scene)
         friction = 0.1 if np.isnan(own.friction) else own.friction
         mechanics = SimulatedDevice(
-            hand=hand, mass=own.mass, damping=own.damping, friction=friction
+            hand=hand,
+            mass=own.mass,
+            damping=own.damping,
+            friction=friction,
+            rotational_inertia=own.rotational_inertia,
+            rotational_damping=own.rotational_damping,
+            path=path,
         )
         self.mechanics, self.board = mechanics, LoopBoard(library, mechanics, own, link)
-        self.seam = HidSeam(self.board)
+        self.seam, self.said = HidSeam(self.board), list[str]()
         self.device = self.opened(**options)
 
     def opened(self, **options: object) -> RawHidDevice:
         """Opens the board, which has run since its start."""
-        return open_rawhid(options, ignore_message, self.seam, lambda: self.seam.now)
+        return open_rawhid(options, self.said.append, self.seam, lambda: self.seam.now)
 
     def bridge(self, coupling: Any = None, **options: Any) -> hb.Bridge:
         clock = DrivingClock(self.seam)
@@ -141,6 +155,8 @@ def test_a_scene_may_be_scaled_turned_and_slow(library: ctypes.CDLL, tmp_path: P
     assert hb.audit(path, in_process=True).verdict == "passive"
 
 
+SIX_AXES = BoardSheet(axes=0b111111 | POSE, friction=0.0, resolution=0.0)
+
 KNOB = """<mujoco><worldbody><body><joint type="hinge" axis="0 0 1" range="-20 20" limited="true"/>
 <geom type="cylinder" size=".03 .01" mass=".1"/><site name="grip"/></body></worldbody></mujoco>"""
 
@@ -153,18 +169,13 @@ def test_a_knob_feels_the_stop_of_a_hinge(library: ctypes.CDLL, tmp_path: Path) 
     table = np.column_stack(
         [times, np.zeros((301, 3)), np.cos(half), np.zeros((301, 2)), np.sin(half)]
     )
-    sheet = BoardSheet(axes=0b100000, damping=1e-3, friction=0.0, resolution=0.0, force_limit=0.05)
-    mechanics = SimulatedDevice(
-        rotational_inertia=1e-5,
-        rotational_damping=1e-3,
-        path=Motion(times, table[:, 1:4], table[:, 4:]),
+    sheet = replace(
+        SIX_AXES, axes=0b100000, rotational_damping=1e-3, rotational_inertia=1e-5, torque_limit=0.05
     )
-    board = LoopBoard(library, mechanics, sheet, 0.5e-3)
-    seam, path = HidSeam(board), tmp_path / "run.mcap"
-    device = open_rawhid({}, ignore_message, seam, lambda: seam.now)
-    assert (device.info.axes, device.info.loop_period) == (("rz",), 1e-4)
-    clock = DrivingClock(seam)
-    with hb.Bridge(tmp_path / "knob.xml", device, clock=clock, recording=path) as bridge:
+    motion, path = Motion(times, table[:, 1:4], table[:, 4:]), tmp_path / "run.mcap"
+    bench = Bench(library, str(tmp_path / "knob.xml"), sheet, path=motion)
+    assert (bench.device.info.axes, bench.device.info.loop_period) == (("rz",), 1e-4)
+    with bench.bridge(recording=path) as bridge:
         summary = bridge.run(1.6)
         ticks = bridge.latest_records(800)
     stiffness = bridge.setup.law.rotational_stiffness
@@ -172,8 +183,118 @@ def test_a_knob_feels_the_stop_of_a_hinge(library: ctypes.CDLL, tmp_path: Path) 
     deepest = ticks[np.argmax(np.abs(ticks["wrench_on_device"][:, 5]))]
     assert -deepest["wrench_on_device"][5] == pytest.approx(0.05, rel=1e-3)
     assert summary.is_certified
-    assert board.work - board.burned < ROUNDING
+    assert bench.gained < ROUNDING
     assert hb.audit(path, in_process=True).verdict == "passive"
+
+
+@pytest.mark.parametrize("scene", ["peg_in_hole", "screwdriver", "hex_key"])
+@pytest.mark.parametrize("link", [0.0, 5e-3])
+def test_a_six_axis_board_gives_no_hand_energy(
+    library: ctypes.CDLL, tmp_path: Path, scene: str, link: float
+) -> None:
+    bench, path = Bench(library, scene, SIX_AXES, link), tmp_path / "run.mcap"
+    with bench.bridge(recording=path) as bridge:
+        summary = bridge.run(1.5)
+    law = bridge.setup.law
+    assert law.rotational_stiffness > 10.0
+    assert law.rotational_damping == 0.0
+    assert summary.is_certified
+    assert [each.axis for each in summary.certification.conditions] == ["translation", "rotation"]
+    assert summary.peak_torque > 2e-3
+    assert bench.gained < ROUNDING
+    report = hb.audit(path, in_process=True)
+    assert (report.verdict, report.agreement) == ("passive", "bit for bit")
+
+
+def test_the_boards_torque_bears_what_the_hosts_does_not(library: ctypes.CDLL) -> None:
+    """The same six-axis device behind 2 ms, at the same rotational stiffness."""
+    stiff = {"rotational_stiffness": 20.0, "rotational_damping": 0.0}
+    board = Bench(library, "hex_key", SIX_AXES, 1e-3)
+    with board.bridge(stiff) as bridge:
+        summary = bridge.run(2.0)
+    assert summary.is_certified
+    assert board.gained < ROUNDING
+    host = Bench(library, "hex_key", SIX_AXES, 1e-3, loop_rate=0.0)
+    assert host.device.info.loop_period is None
+    with host.bridge() as bridge:
+        assert bridge.run(0.5).is_certified
+        assert bridge.setup.law.rotational_stiffness < 2.0
+    assert host.gained < ROUNDING
+    swinging = Bench(library, "hex_key", SIX_AXES, 1e-3, loop_rate=0.0)
+    with contextlib.suppress(SafetyTrip), swinging.bridge(stiff) as bridge:
+        bridge.run(2.0)
+    assert bridge.summary().is_certified is False
+    assert swinging.gained > 100.0 * ROUNDING
+
+
+def test_rotations_of_a_turned_and_scaled_scene_are_shown_as_they_are(
+    library: ctypes.CDLL, tmp_path: Path
+) -> None:
+    """The board is shown the tool's rotation in the device's frame; angles are not scaled."""
+    turned = hb.Workspace(scale=2.0, axes=((0, 1, 0), (0, 0, 1), (1, 0, 0)))
+    path, times = tmp_path / "run.mcap", np.linspace(0.0, 1.5, 151)
+    half = 0.2 * np.sin(np.pi * np.clip(times - 0.5, 0.0, 1.0))  # after the rise of the force
+    away = np.column_stack([np.cos(half), np.zeros((151, 2)), np.sin(half)])
+    motion = Motion(times, np.zeros((151, 3)), away)
+    bench = Bench(library, "peg_in_hole", SIX_AXES, path=motion)
+    found: list[tuple[Any, Any]] = []
+    show = bench.device.show
+
+    def note(shown: ShownTool) -> int:
+        if rows := len(bridge.latest_records(1)):
+            found.append((shown.rotation, bridge.latest_records(rows)["tool_quaternion"][0].copy()))
+        return show(shown)
+
+    bench.device.show = note  # type: ignore[method-assign]
+    with bench.bridge(workspace=turned, recording=path) as bridge:
+        summary = bridge.run(1.4)
+        parameters = bridge.session.parameters
+    axes = np.array(parameters.axes).reshape(3, 3)
+    w, *begin = parameters.handle_origin[3:]
+    angles = []
+    for rotation, tool in found:
+        x, y, z = (axes @ np.array(rotation)).tolist()
+        mapped = product(quaternion_exp((x, y, z)), (w, begin[0], begin[1], begin[2]))
+        angles.append(np.linalg.norm(rotation_between(tuple(tool), mapped)))
+    assert max(np.linalg.norm(rotation) for rotation, _ in found) > 0.3
+    assert max(angles) < 0.03
+    assert summary.is_certified
+    assert bench.gained < ROUNDING
+    assert hb.audit(path, in_process=True).verdict == "passive"
+
+
+def test_a_boards_rotation_that_it_does_not_render_stays_with_the_bridge(
+    library: ctypes.CDLL,
+) -> None:
+    """A board from before, and a handle about two axes; one about one axis beside lines has it."""
+    for axes, has_own in (
+        (0b111111, False),
+        (0b011111 | POSE, False),
+        (0b100111 | POSE, True),
+        (0b111000 | POSE, True),
+    ):
+        bench = Bench(library, "point_mass", replace(SIX_AXES, axes=axes))
+        assert (bench.device.info.loop_period is not None) is has_own
+        idle = [each for each in bench.said if "the loop on the board of 'board' does not" in each]
+        assert len(idle) == (not has_own)
+        assert not Bench(library, "point_mass", SIX_AXES, loop_rate=0.0).said
+        with bench.bridge() as bridge:
+            summary = bridge.run(0.4)
+        assert summary.is_certified
+        assert bench.gained < ROUNDING
+
+
+def test_states_without_their_rotation_are_lost(library: ctypes.CDLL) -> None:
+    bench = Bench(library, "peg_in_hole", SIX_AXES)
+
+    def lose(tick: int) -> None:
+        bench.board.loses_turns = 200 <= tick < 220
+
+    with bench.bridge() as bridge:
+        summary = bridge.run(0.4, lose)
+    assert 18 <= bench.device.states.lost <= 21
+    assert summary.is_certified
+    assert bench.gained < ROUNDING
 
 
 def test_a_recorded_run_repeats_to_the_bit_with_commands(
@@ -259,6 +380,71 @@ def test_what_a_board_cannot_have_is_left_to_the_bridge(library: ctypes.CDLL) ->
         assert not bridge.setup.info.loop_period
 
 
+def test_a_silent_host_lets_the_force_go_in_the_time_that_the_guide_says(
+    library: ctypes.CDLL,
+) -> None:
+    bench, forces = Bench(library), []
+
+    def cut(tick: int) -> None:
+        bench.board.is_cut = tick >= 800
+        forces.append(float(np.linalg.norm(bench.board.force)))
+
+    with bench.bridge() as bridge:
+        bridge.run(0.86, cut)
+    after = forces[800:]
+    silence, fade = 1e3 * watchdog_time(1e-3), 1e3 * FADE
+    end = round(silence + fade)
+    assert after[round(silence) - 2] > 0.9 * after[0] > 1.0
+    assert after[end - 4] > 0.0
+    assert after[end + 2] == 0.0
+    words = f"at least {silence:g} ms | the force fades in another {fade:g} ms: at 1 kHz it is zero"
+    assert f"{words} {end} ms after the last pose" in page("stiff-device")
+
+
+@pytest.mark.parametrize("loop_delay", [1e-5, 1.5e-4])
+@pytest.mark.parametrize("stiffness", [1e3, 15e3, 60e3])
+def test_bound_states_the_condition_of_a_run(
+    library: ctypes.CDLL, call: Called, stiffness: float, loop_delay: float
+) -> None:
+    bench = Bench(library, sheet=BoardSheet(loop_delay=loop_delay))
+    coupling = {"stiffness": stiffness, "damping": 3.0}
+    with bench.bridge(coupling) as bridge:
+        (condition,) = conditions_of(bridge.setup.loop)
+        assert bridge.conditions() == (condition.sentence(),)
+    own = f"--loop-rate 1e4 --loop-delay {loop_delay}"
+    device = "simulated:damping=2,friction=0.1,resolution=1e-5"
+    judged = f"bound --stiffness {stiffness} --damping 3 {own} --device {device}"
+    code, out, err = call(*judged.split())
+    assert condition.sentence() in out.replace("\n", " ")
+    assert (code, err) == (int(not condition.holds), "")
+    assert "in its own loop" in out
+
+
+JUDGED = "bound --stiffness 15000 --loop-rate 1e4 --loop-delay 1e-5"
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (f"{JUDGED} --device-damping 2 --plot x.png", "for a loop on the computer"),
+        (JUDGED, "--loop-rate goes with --device or --device-damping"),
+        ("bound --stiffness 1 --loop-rate 1e4 --device-damping 2", "needs --loop-delay"),
+        ("bound --stiffness 1 --loop-delay 1e-5 --device-damping 2", "has no effect"),
+        ("run point_mass --device simulated:loop_rate=1e4", "'hapticbridge bound --loop-rate HZ"),
+    ],
+)
+def test_a_loop_that_cannot_be_judged_is_refused(call: Called, command: str, message: str) -> None:
+    code, out, err = call(*command.split())
+    assert (code, out, message in err.replace("\n", " ")) == (2, "", True)
+
+
+def test_bound_judges_a_board_that_is_not_built(call: Called) -> None:
+    for damping, is_enough in ((1.0, True), (0.9, False)):
+        code, facts = facts_of(call, *JUDGED.split(), "--device-damping", damping)
+        # K (T_b/2 + 1.5 t)
+        assert (code, facts["needed"]) == (int(not is_enough), pytest.approx(0.975, rel=1e-3))
+
+
 class Jerky:
     """A device whose own loop reports a force at the end of each move, and none before it."""
 
@@ -266,7 +452,7 @@ class Jerky:
         name="jerky", axes=("x",), force_limit=10.0, damping=2.0, delay=0.0, loop_period=1e-4
     )  # fmt: skip
     loop_report: LoopReport | None = None
-    place = (0.0, 0.0, 0.0)
+    place, is_posed = (0.0, 0.0, 0.0), False
 
     def __init__(self) -> None:
         self.info = replace(self.info, is_real=False)
@@ -376,7 +562,7 @@ def test_a_run_ends_what_an_earlier_program_has_left(
 class Answering:
     """A device that is shown tools, and answers the newest alone."""
 
-    place, loop_report = (0.0, 0.0, 0.0), None
+    place, loop_report, is_posed = (0.0, 0.0, 0.0), None, False
 
     def __init__(self, info: hb.DeviceInfo) -> None:
         self.info, self.loop_state = info, loop_state(0, 0.0)
@@ -515,3 +701,53 @@ def test_a_certificate_with_unknown_friction_says_so_in_its_first_line(
         summary = bridge.run(0.5)
     assert summary.is_certified
     assert summary.headline.endswith(", if its friction holds the encoder's steps")
+
+
+@pytest.mark.parametrize("limit", [80.0, 90.0, float("nan")])
+def test_the_motors_temperature_is_reported_and_warned_of_near_its_limit(
+    library: ctypes.CDLL, tmp_path: Path, limit: float
+) -> None:
+    bench, path = Bench(library), tmp_path / "run.mcap"
+    with warnings.catch_warnings(record=True) as said, bench.bridge(recording=path) as bridge:
+        warnings.simplefilter("always")
+        bench.board.firmware.heat(72.4, limit)
+        bridge.run(0.2)
+        bench.board.firmware.heat(71.0, limit)
+        summary = bridge.run(0.2)
+    own = summary.certification.own_loop
+    assert own is not None
+    assert own.temperature == pytest.approx(72.4)
+    assert "its motors reached 72 °C" in str(summary)
+    assert ("are switched off at" in str(summary)) is not np.isnan(limit)
+    sentence = "board: its motors reached 72 °C, and are switched off at 80 °C; let them rest"
+    assert [str(each.message) for each in said] == [sentence] * (limit == 80.0)
+    audited = hb.audit(path, in_process=True).certification
+    assert audited is not None
+    assert audited.own_loop == own
+
+
+def test_a_board_without_a_thermometer_says_nothing_of_temperature(library: ctypes.CDLL) -> None:
+    with Bench(library).bridge() as bridge:
+        summary = bridge.run(0.2)
+    assert "°C" not in str(summary)
+
+
+FAULTS = {
+    8: "a fault of its own (status 0x09) and gives no force; restart and home it",
+    8 + 64: "that a motor or its driver is too hot (status 0x49) and gives no force; let it cool",
+    8 + 128: "that an encoder is not read (status 0x89) and gives no force; check its cable",
+    8 + 192: "that a motor's driver has switched off (status 0xc9) and gives no force; check",
+}
+
+
+@pytest.mark.parametrize("status", FAULTS)
+def test_a_fault_is_said_by_its_name(library: ctypes.CDLL, status: int) -> None:
+    bench = Bench(library)
+
+    def fail(tick: int) -> None:
+        bench.board.status = status * (tick > 100)
+
+    with pytest.raises(SafetyTrip) as trip, bench.bridge() as bridge:
+        bridge.run(0.2, fail)
+    assert FAULTS[status] in str(trip.value)
+    assert np.linalg.norm(bench.board.force) == 0.0

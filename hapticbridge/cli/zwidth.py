@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import shlex
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from rich.table import Table
@@ -25,7 +26,7 @@ from hapticbridge.demand.plots import (
     recommended_coupling,
 )
 from hapticbridge.device import AXES, Device, DeviceInfo, open_device
-from hapticbridge.device.base import checked_close
+from hapticbridge.device.base import USUAL_FORCE_LIMIT, checked_close
 from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.identify.z_width import SHARES, MeasuredWidth, measure_width, measured_points
 from hapticbridge.kernel.parameters import whole_ticks
@@ -295,6 +296,7 @@ class Bound:
     Examples:
         hapticbridge bound --stiffness 2000 --damping 1 --rate 1000
         hapticbridge bound --stiffness 2000 --damping 1 --device simulated:damping=3
+        hapticbridge bound --stiffness 15000 --device-damping 2 --loop-rate 1e4 --loop-delay 1e-5
     """
 
     stiffness: float = shared(Coupling, "stiffness")
@@ -309,6 +311,10 @@ class Bound:
     its driver or its profile ('hapticbridge identify' writes one). It is opened, and not moved."""
     device_damping: float | None = option(None, unit="N s/m", least=0.0, is_open=True)
     """Physical damping b in N s/m of a device without delay, in place of --device."""
+    loop_rate: float | None = option(None, unit="Hz", least=0.0, is_open=True)
+    """Rate of a loop on the device's own board, which then renders the coupling."""
+    loop_delay: float | None = option(None, unit="s", least=0.0, is_open=True)
+    """Time in s in that loop from reading a position to its force."""
     plot: Path | None = None
     """Draw the damping needed over frequency into this picture (.png, .svg or .pdf)."""
     as_json: bool = option(False, flag="json")
@@ -320,10 +326,9 @@ class Bound:
         info = self._info()
         rate = rate_for(self.rate, info)
         period = period_of(rate)
-        if info is not None:
-            info, period = pulling_loop(info, period)
-            rate = 1.0 / period
         coupling = Coupling(self.stiffness, self.damping, 0.0, 0.0)
+        if info is not None and info.loop_period is not None:
+            return self._judge_own_loop(info, coupling, period)
         filter_time = period if self.filter_time is None else self.filter_time
         ways = alternatives(coupling, period, filter_time)
         shown = RunCoupling.of(default_method(), period, coupling)
@@ -335,21 +340,9 @@ class Bound:
         if condition is not None:
             holds = condition.holds
         if self.as_json:
-            print_json(
-                {
-                    "needed": ways[0].needed if condition is None else condition.needed,
-                    "frequency_hz": _hertz(ways[0]),
-                    "holds": holds,
-                    "method": default_method().name,
-                    "coupling": asdict(shown),
-                    "largest_stiffness": self._largest_stiffness(b, period),
-                    "device": None if info is None else _device_facts(info, condition),
-                    "alternatives": [
-                        {"name": way.name, "needed": way.needed, "frequency_hz": _hertz(way)}
-                        for way in ways
-                    ],
-                }
-            )
+            facts = _facts(shown, ways, condition, info)
+            largest = self._largest_stiffness(b, period)
+            print_json(facts | {"holds": holds, "largest_stiffness": largest})
         else:
             self._print(ways, shown, period, b, info, condition)
             if condition is not None and (b is None or condition.steps is not None):
@@ -359,8 +352,58 @@ class Bound:
             write_figure(draw_alternatives(ways, title, b), self.plot)
         return 1 if holds is False else 0
 
+    def _judge_own_loop(self, info: DeviceInfo, coupling: Coupling, period: float) -> int:
+        """Prints the condition in a loop of the device's own, with T of the run in s."""
+        if self.plot is not None or self.filter_time is not None:
+            raise HapticBridgeError(
+                "--plot and --filter-time are for a loop on the computer: leave them out with a "
+                "loop of the device's own"
+            )
+        shown = RunCoupling.of(default_method(), period, coupling)
+        shown = shown.felt_at("", 1.0, 1.0, is_apart=True)
+        condition = _condition(info, coupling, period)
+        if self.as_json:
+            facts = _facts(shown, (), condition, info)
+            print_json(facts | {"holds": condition.holds, "largest_stiffness": None})
+        else:
+            (sentence,) = shown.sentences()
+            out.print(sentence)
+            out.print(plain(condition.sentence()))
+        return 1 if condition.holds is False else 0
+
     def _info(self) -> DeviceInfo | None:
-        """Returns the data sheet of --device, with its profile; None without that option."""
+        """Returns the device's data sheet, with its profile and its loop; None if none is named.
+
+        Raises:
+            HapticBridgeError: Options exclude each other, or a number that is needed is missing.
+        """
+        info = self._opened_info()
+        if self.loop_rate is None:
+            if self.loop_delay is not None:
+                raise HapticBridgeError("--loop-delay without --loop-rate HZ has no effect")
+            return info
+        if self.loop_delay is None:
+            raise HapticBridgeError(
+                "--loop-rate needs --loop-delay, the time in s from reading a position to its force"
+            )
+        if info is None and self.device_damping is not None:
+            info = DeviceInfo(
+                name="device",
+                axes=AXES[:1],
+                damping=self.device_damping,
+                resolution=0.0,
+                force_limit=USUAL_FORCE_LIMIT,
+                delay=0.0,
+            )
+        if info is None:
+            raise HapticBridgeError("--loop-rate goes with --device or --device-damping")
+        if info.loop_period is not None:
+            raise HapticBridgeError(
+                f"--device {self.device} has a loop of its own: leave --loop-rate out"
+            )
+        return replace(info, loop_period=1.0 / self.loop_rate, loop_delay=self.loop_delay)
+
+    def _opened_info(self) -> DeviceInfo | None:
         if self.device is None:
             return None
         if self.device_damping is not None:
@@ -464,7 +507,9 @@ def _condition(info: DeviceInfo, coupling: Coupling, period: float) -> DampingCo
     """Returns the condition for translation that a run with scale 1 would print."""
     method = default_method()
     law = method.law_coupling(coupling, period)
-    conditions = conditions_of(LoopSetting(info=info, law=law, period=period, method=method))
+    own, own_period = pulling_loop(info, period)
+    loop = LoopSetting(info=own, law=law, period=own_period, method=method, timestep=period)
+    conditions = conditions_of(loop)
     return next(condition for condition in conditions if condition.axis == "translation")
 
 
@@ -473,9 +518,29 @@ def _is_prompt(info: DeviceInfo, period: float) -> bool:
     return bool(info.damping and info.delay is not None and Lag.of(info, period) == IN_TIME)
 
 
+def _facts(
+    shown: RunCoupling,
+    ways: Sequence[Alternative],
+    condition: DampingCondition | None,
+    info: DeviceInfo | None,
+) -> dict[str, object]:
+    """Returns what is printed as JSON of a coupling and its alternatives."""
+    return {
+        "needed": ways[0].needed if condition is None else condition.needed,
+        "frequency_hz": _hertz(ways[0]) if ways else None,
+        "method": default_method().name,
+        "coupling": asdict(shown),
+        "device": None if info is None else _device_facts(info, condition),
+        "alternatives": [
+            {"name": way.name, "needed": way.needed, "frequency_hz": _hertz(way)} for way in ways
+        ],
+    }
+
+
 def _device_facts(info: DeviceInfo, condition: DampingCondition | None) -> dict[str, object]:
     needed = None if condition is None else condition.needed
-    numbers = {name: getattr(info, name) for name in ("damping", "mass", "delay", "rate")}
+    names = "damping", "mass", "delay", "rate", "loop_period", "loop_delay"
+    numbers = {name: getattr(info, name) for name in names}
     return {"name": info.name, **numbers, "needed": needed}
 
 

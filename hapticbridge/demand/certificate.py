@@ -98,11 +98,11 @@ def default_coupling(
     lag = assumed_lag(own, own_period)
     if info.loop_period is not None:
         share = NEEDED_SHARE / required_damping(Coupling(1.0, 0.0), own_period, lag=lag)
-        coupling = (
-            replace(coupling, stiffness=share * damping, damping=0.0)
-            if info.moves
-            else replace(coupling, rotational_stiffness=share * rotational, rotational_damping=0.0)
-        )
+        if info.moves:
+            coupling = replace(coupling, stiffness=share * damping, damping=0.0)
+        if info.turns:
+            stiffness = share * rotational
+            coupling = replace(coupling, rotational_stiffness=stiffness, rotational_damping=0.0)
     elif lag != IN_TIME:
         linear = stiffest_late_coupling(damping, period, lag.delay, lag.ticks_per_sample)
         coupling = replace(coupling, stiffness=linear[0], damping=linear[1])

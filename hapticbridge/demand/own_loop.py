@@ -25,6 +25,13 @@ shown, Σ P and D, all in J."""
 COUNTERS = ("changes", "ticks", "missed")
 """Counters of the loop that are recorded, since it began (``device.own_loop.LoopReport``)."""
 
+TEMPERATURES = ("temperature", "temperature_limit")
+"""Temperature of the motors and its limit in °C; each is recorded where the device reports it."""
+
+HOT = 10.0
+"""Temperature in °C below its limit from which motors count as hot. A winding rises by about a
+degree per second at full force; a larger value warns of motors that would have stayed below."""
+
 ROUNDING = 1e-6
 """Energy in J by which Σ P may pass its bound: the loop adds in single precision."""
 
@@ -57,6 +64,8 @@ class OwnLoopAccount:
         periods: Periods of the loop in the run.
         missed: Periods that came too late.
         changes: Σ |w_k − w_{k−1}| over periods and axes in N.
+        temperature: Highest temperature of the motors in °C; None if unknown.
+        temperature_limit: Temperature in °C at which the device switches them off; None if unknown.
     """
 
     period: float
@@ -69,6 +78,8 @@ class OwnLoopAccount:
     periods: int = 0
     missed: int = 0
     changes: float = 0.0
+    temperature: float | None = None
+    temperature_limit: float | None = None
 
     def times(self, times: RunTimes, period: float) -> RunTimes:
         """Returns the times of a run as those of the loop: it reads in time or misses a period.
@@ -114,7 +125,23 @@ class OwnLoopAccount:
         if self.resolution:
             blur = format_energy(0.5 * self.resolution * self.changes)
             told += f" (steps of the encoder blur this by {blur})"
-        return told
+        return f"{told}; {self.heat}" if self.heat else told
+
+    @property
+    def heat(self) -> str:
+        """Clause on the highest temperature of the motors; empty if unknown."""
+        if self.temperature is None:
+            return ""
+        most = f"its motors reached {self.temperature:.0f} °C"
+        if self.temperature_limit is None:
+            return most
+        return f"{most}, and are switched off at {self.temperature_limit:.0f} °C"
+
+    @property
+    def is_hot(self) -> bool:
+        """True if the motors came near the temperature at which they are switched off."""
+        temperature, limit = self.temperature, self.temperature_limit
+        return temperature is not None and limit is not None and temperature > limit - HOT
 
 
 @dataclass(slots=True)
@@ -135,7 +162,7 @@ class OwnLoopTally:
         return cls(OwnLoopAccount(period, resolution))
 
     def add(self, reports: NDArray[np.void], counters: Mapping[str, float]) -> None:
-        """Adds reports, and counters of the loop if they are known."""
+        """Adds reports, and counters and temperatures of the loop if they are known."""
         own = self.account
         if reports.size:
             if self._before is None:
@@ -155,7 +182,11 @@ class OwnLoopTally:
                 excess=max(own.excess, float(over.max())),
                 excess_tick=tick,
             )
-        if counters:
+        if (heat := counters.get("temperature")) is not None:
+            warmest = heat if own.temperature is None else max(heat, own.temperature)
+            limit = counters.get("temperature_limit", own.temperature_limit)
+            own = replace(own, temperature=warmest, temperature_limit=limit)
+        if "ticks" in counters:
             self._first = first = self._first or counters
             own = replace(
                 own,
@@ -179,8 +210,9 @@ class OwnLoopTally:
 def _read(event: Mapping[str, Any]) -> tuple[NDArray[np.void], dict[str, float]]:
     try:
         reports = np.frombuffer(base64.b64decode(event["reports"], validate=True), REPORT_DTYPE)
-        counters = {name: event[name] for name in COUNTERS if name in event}
-        is_whole = len(counters) in (0, len(COUNTERS)) and all(map(is_number, counters.values()))
+        counters = {name: event[name] for name in (*COUNTERS, *TEMPERATURES) if name in event}
+        known = sum(name in event for name in COUNTERS)
+        is_whole = known in (0, len(COUNTERS)) and all(map(is_number, counters.values()))
         numbers = [reports[name] for name in REPORT_DTYPE.names or ()]
         is_sound = all(np.isfinite(each).all() for each in numbers)
     except (KeyError, TypeError, ValueError):

@@ -21,6 +21,9 @@ SURFACES = 3
 """Surfaces near the tool that a loop on a board takes with a pose."""
 
 
+_NONE = (0.0, 0.0, 0.0)
+
+
 class LoopState(NamedTuple):
     """State of the device while its own loop follows a shown tool.
 
@@ -31,6 +34,8 @@ class LoopState(NamedTuple):
             frame; of a device that only turns in rad, rad/s and N m.
         passed: Σ P, what the coupling has given to the shown tool, in J.
         tank: D, what the shown tool may still give, in J.
+        rotation, angular_velocity, torque: Rotation vector of the handle in rad, its angular
+            velocity in rad/s and the torque on it in N m, of a loop that renders rotation; else 0.
     """
 
     status: int
@@ -43,19 +48,19 @@ class LoopState(NamedTuple):
     passed: float
     tank: float
     echo: int
+    rotation: tuple[float, ...] = _NONE
+    angular_velocity: tuple[float, ...] = _NONE
+    torque: tuple[float, ...] = _NONE
 
     @property
     def numbers(self) -> tuple[float, ...]:
         """Position, rotation, velocity and angular velocity, as ``State`` has them."""
-        return (*self.position, *_NO_TURN, *self.velocity, *_NO_TURN)
+        return (*self.position, *self.rotation, *self.velocity, *self.angular_velocity)
 
     @property
     def is_finite(self) -> bool:
         """True if all numbers are finite."""
-        return all(map(math.isfinite, (*self.numbers, *self.force, self.tank)))
-
-
-_NO_TURN = (0.0, 0.0, 0.0)
+        return all(map(math.isfinite, (*self.numbers, *self.force, *self.torque, self.tank)))
 
 
 class LoopReport(NamedTuple):
@@ -69,7 +74,8 @@ class LoopReport(NamedTuple):
         ticks: Periods so far.
         missed: Periods that the timer has missed.
         share: Share of the gains in force, 0 to 1.
-        temperature: Temperature of the motors in °C; NaN if unknown.
+        temperature: Temperature of the motors in °C; None if unknown.
+        temperature_limit: Temperature in °C at which they are switched off; None if unknown.
         tool: Position of the shown tool in m.
     """
 
@@ -80,7 +86,8 @@ class LoopReport(NamedTuple):
     ticks: int
     missed: int
     share: float
-    temperature: float
+    temperature: float | None
+    temperature_limit: float | None
     tool: tuple[float, ...]
 
 
@@ -94,6 +101,8 @@ class ShownTool(NamedTuple):
         surfaces: At most ``SURFACES`` surfaces near it: normal and gap in m.
         is_placed: True if it was put there, and the force begins anew.
         is_enabled: False ends the force.
+        rotation, angular_velocity: Its rotation vector in rad, of at most half a turn, and its
+            angular velocity in rad/s, for a loop that renders rotation; else not used.
     """
 
     position: tuple[float, ...]
@@ -102,6 +111,8 @@ class ShownTool(NamedTuple):
     surfaces: tuple[tuple[tuple[float, ...], float], ...] = ()
     is_placed: bool = False
     is_enabled: bool = True
+    rotation: tuple[float, ...] = _NONE
+    angular_velocity: tuple[float, ...] = _NONE
 
 
 class BoardSetting(NamedTuple):
@@ -114,6 +125,8 @@ class BoardSetting(NamedTuple):
         passing: Energy in J that may be under way between two shown tools.
         fade: Time in s in which the force rises and fades, and gains change.
         credit: E in J, what the tool may give beyond what it got.
+        rotational_stiffness, rotational_damping, torque_level: K_r in N m/rad, B'_r in N m s/rad
+            and the torque level in N m of a loop that renders rotation; else not used.
     """
 
     stiffness: float
@@ -122,6 +135,9 @@ class BoardSetting(NamedTuple):
     passing: float
     fade: float
     credit: float = 0.0
+    rotational_stiffness: float = 0.0
+    rotational_damping: float = 0.0
+    torque_level: float = 0.0
 
 
 class LoopDevice(Device, Protocol):
@@ -130,11 +146,13 @@ class LoopDevice(Device, Protocol):
     It follows ``write`` until the first ``show``, and again from the next ``write`` on.
 
     Attributes:
+        is_posed: True if the loop renders rotation about up to three axes beside lines.
         place: Newest position in m, or angles in rad of a device that only turns.
         loop_state: Its newest state in the loop; None before the first.
         loop_report: Newest counters of its loop; None before the first.
     """
 
+    is_posed: bool
     place: tuple[float, ...]
     loop_state: LoopState | None
     loop_report: LoopReport | None

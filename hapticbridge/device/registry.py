@@ -211,6 +211,11 @@ def refuse_unknown(device: str, options: Iterable[str], valid: Iterable[str]) ->
     """Raises DeviceError for an unknown option; the message lists the valid ones."""
     names = tuple(valid)
     unknown = [name for name in options if name not in names]
+    if device == "simulated" and not {"loop_rate", "loop_delay"}.isdisjoint(unknown):
+        raise DeviceError(
+            "the simulated device has no board with a loop of its own; 'hapticbridge bound "
+            "--loop-rate HZ --loop-delay SECONDS' judges a coupling on one without hardware"
+        )
     if unknown:
         raise DeviceError(
             f"unknown option '{unknown[0]}' of the {device} device; choose one of {choices(names)}"

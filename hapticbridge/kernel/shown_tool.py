@@ -376,12 +376,12 @@ def shown_to_device(state: NDArray[np.void], lead: float, numbers: NDArray[np.fl
         state: The bound state.
         lead: Time in s by which the tool is foreseen: from the sample to its coming to the device.
         numbers: Receives, in the device's frame, the way from the handle to the tool in m and its
-            velocity in m/s, the work W that the scene has taken in J at the hand, and per surface
-            its normal and gap in m, the nearest surfaces first. For a device that only turns they
-            are in rad and rad/s, without surfaces.
+            velocity in m/s, the work W that the scene has taken in J at the hand, the rotation
+            vector from the handle to the tool in rad and its angular velocity in rad/s, and per
+            surface its normal and gap in m, the nearest surfaces first.
 
     Returns:
-        The number of surfaces.
+        The number of surfaces; none for a device that only turns.
     """
     s = state[0]
     shown, pose, run = s.shown, s.pose, s.run
@@ -390,31 +390,31 @@ def shown_to_device(state: NDArray[np.void], lead: float, numbers: NDArray[np.fl
     store_quaternion(shown.newest[3:7], turn)
     _take_planes(s, s)
     numbers[6] = run.force_scale / run.scale * s.energy.coupling_work
-    lacks = s.coupling.lacks_motor
-    if lacks[0] + lacks[1] + lacks[2] == 3.0:
-        velocity = scaled(1.0 / run.period, vector_of(s.loop.motion[3:6]))
-        twist = rotation_between(quaternion_of(pose.handle_quaternion), turn)
-        ahead = scaled(lead, velocity)
-        store_vector(numbers[0:3], device_from_scene(run.axes, add(twist, ahead)))
-        store_vector(numbers[3:6], device_from_scene(run.axes, velocity))
-        return 0
+    turning = scaled(1.0 / run.period, vector_of(s.loop.motion[3:6]))
+    foreseen = product(quaternion_exp(scaled(lead, turning)), turn)
+    twist = rotation_between(quaternion_of(pose.handle_quaternion), foreseen)
+    store_vector(numbers[7:10], device_from_scene(run.axes, twist))
+    store_vector(numbers[10:13], device_from_scene(run.axes, turning))
     velocity = scaled(1.0 / run.period, vector_of(s.loop.motion))
     ahead = scaled(lead, velocity)
     stretch = add(subtract(tool, vector_of(pose.handle_position)), ahead)
     scale = 1.0 / run.scale
     store_vector(numbers[0:3], device_from_scene(run.axes, scaled(scale, stretch)))
     store_vector(numbers[3:6], device_from_scene(run.axes, scaled(scale, velocity)))
+    lacks = s.coupling.lacks_motor
+    if lacks[0] + lacks[1] + lacks[2] == 3.0:
+        return 0
     moved = add(subtract(tool, vector_of(shown.before)), ahead)
     # several contacts of one face are one surface to a tool that moves along lines
     turned = rotation_between(quaternion_of(shown.before[3:7]), turn)
     count = 0
-    for first in range(7, numbers.size - 3, 4):
+    for first in range(13, numbers.size - 3, 4):
         nearest, least = -1, np.inf
         for k in range(shown.planes):
             normal = vector_of(shown.normals[3 * k : 3 * k + 3])
             arm = vector_of(shown.arms[3 * k : 3 * k + 3])
             gap = shown.gaps[k] + dot(normal, add(moved, cross(turned, arm)))
-            for earlier in range(7, first, 4):
+            for earlier in range(13, first, 4):
                 known = scene_from_device(run.axes, vector_of(numbers[earlier : earlier + 3]))
                 if dot(known, normal) > ALIKE:
                     gap = np.inf

@@ -198,6 +198,8 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
         facts.append(("device condition", certification.fact))
         if certification.kept.remark:
             facts.append(("time kept", certification.kept.remark))
+        if certification.own_loop:
+            facts.append(("device's loop", certification.own_loop.words))
     if report.slack_share:
         facts.append(("slack used", format_share(report.slack_share)))
     return [*facts, ("simulated again", report.resimulation or "not reached")]

@@ -385,7 +385,7 @@ def _usual_coupling(
 def _suits_own_loop(scene: Scene, method: Method) -> bool:
     """Returns True if a device with a loop of its own renders the coupling itself.
 
-    It has the coupling's law, and one tool of the bridge's scene that it moves along lines.
+    It has the coupling's law, and one tool of the bridge's scene.
     """
     is_one = not scene.has_several_hands and scene.joint < 0
     return method.can_be_slow and is_one and scene.credit == 0.0

@@ -12,12 +12,13 @@ one softer.
 from __future__ import annotations
 
 import base64
+from operator import add
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.demand.own_loop import COUNTERS, REPORT_DTYPE, OwnLoopTally
+from hapticbridge.demand.own_loop import COUNTERS, REPORT_DTYPE, TEMPERATURES, OwnLoopTally
 from hapticbridge.device.own_loop import (
     SURFACES,
     BoardSetting,
@@ -27,6 +28,13 @@ from hapticbridge.device.own_loop import (
 )
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.pose import (
+    Quaternion,
+    canonical,
+    product,
+    quaternion_exp,
+    quaternion_log,
+)
 from hapticbridge.kernel.shown_tool import FASTEST, FASTEST_TURN, shown_to_device
 from hapticbridge.kernel.state import BoundKernel
 
@@ -34,6 +42,10 @@ AGILITY = 0.05
 """Share of a new measurement of the delay that is taken over at once, without unit."""
 
 _LINES, _TURNS = ("stiffness", "damping"), ("rotational_stiffness", "rotational_damping")
+_WAY, _TWIST, _PLANES = 0, 7, 13
+"""Places of motions along lines, of rotations and of surfaces in what ``shown_to_device`` finds."""
+
+_UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 _REMEMBERED = 256
 """Shown tools whose work is kept until the device has answered them."""
@@ -57,16 +69,15 @@ class OwnLoop:
     def __init__(self, device: LoopDevice, bound: BoundKernel, parameters: RunParameters) -> None:
         self._device, self._state = device, bound.state
         self._parameters = parameters
-        self._numbers = np.zeros(7 + 4 * SURFACES)
+        self._numbers = np.zeros(_PLANES + 4 * SURFACES)
         self._lead = lead = device.info.delay or 0.0  # to the coming of what answers a sample
-        self._turns = not device.info.moves
+        self._is_posed = device.is_posed
+        self._turns = not (device.info.moves or device.is_posed)
         self._part = slice(3, 6) if self._turns else slice(0, 3)
-        self._limit, fastest = parameters.force_limit, FASTEST
-        self._ratio, self._names = parameters.scale * parameters.force_scale, _LINES
-        if self._turns:
-            self._limit, fastest = parameters.torque_limit, FASTEST_TURN
-            self._ratio, self._names = parameters.force_scale / parameters.scale, _TURNS
-        self._passing = 2.0 * self._limit * fastest * (parameters.period + lead)
+        power = parameters.force_limit * FASTEST, parameters.torque_limit * FASTEST_TURN
+        fastest = sum(power) if self._is_posed else power[self._turns]
+        self._passing = 2.0 * fastest * (parameters.period + lead)
+        self._turn = _UPRIGHT
         self._show = direct(shown_to_device, bound.state, lead, self._numbers)
         loop, guard = bound.state["loop"], bound.state["guard"]
         self._reported, self._tick = loop["reported"][0], loop["tick"]
@@ -88,11 +99,14 @@ class OwnLoop:
     def read(self, sample: NDArray[np.void]) -> int:
         """Reads the newest pose and the wrench there, as ``Device.read``."""
         flags = self._device.read(sample)
+        self._turn = tuple(sample["quaternion"][0].tolist())
         state = self._device.loop_state
         if state is None:  # it follows no tool yet, and has no force
             self._reported[:] = 0.0
             return flags
         self._reported[self._part], self._is_followed = state.force, True
+        if self._is_posed:
+            self._reported[3:] = state.torque
         place, tick = state.echo % _REMEMBERED, int(self._tick[0])
         self._note(place, tick, state)
         if self._sent[place] >= 0 and not flags:
@@ -115,20 +129,28 @@ class OwnLoop:
         self._last_lever = lever
         self._tell(cap, is_rising=is_rising)
         count = self._show(self._state, self._lead, self._numbers)
-        dx, dy, dz, vx, vy, vz, work, *planes = self._numbers.tolist()
-        x, y, z = self._device.place
+        numbers = self._numbers.tolist()
+        work, planes = numbers[6], numbers[_PLANES:]
+        first = _TWIST if self._turns else _WAY
+        way, velocity = numbers[first : first + 3], numbers[first + 3 : first + 6]
         surfaces = tuple(
             ((nx, ny, nz), gap)
             for nx, ny, nz, gap in zip(*[iter(planes[: 4 * count])] * 4, strict=True)
         )
         shown = ShownTool(
-            (x + dx, y + dy, z + dz),
-            (vx, vy, vz),
+            tuple(map(add, self._device.place, way)),
+            tuple(velocity),
             work,
             surfaces,
             is_placed=not self._is_followed,
             is_enabled=lever > 0.0 and not is_falling,
         )
+        if self._is_posed:
+            x, y, z, *turning = numbers[_TWIST:_PLANES]
+            orientation = canonical(product(quaternion_exp((x, y, z)), self._turn))
+            shown = shown._replace(
+                rotation=quaternion_log(orientation), angular_velocity=tuple(turning)
+            )
         place = self._device.show(shown) % _REMEMBERED
         self._works[place], self._sent[place] = work, self._tick[0]
         self._least_work = self._least_works[place] = min(self._least_work, work)
@@ -144,17 +166,23 @@ class OwnLoop:
 
     def _setting(self, cap: float, *, is_rising: bool) -> BoardSetting:
         """Returns the coupling at the device; with a lever r it is r² as stiff."""
-        own, coupling = self._parameters, self._coupling
-        gains = coupling["tuning_goal"] if coupling["tuning_ticks"][0] else coupling
-        stiffness, damping = (float(gains[name][0]) for name in self._names)
+        own = self._parameters
         ticks = self._rise_ticks[0] + 1 if is_rising else own.guarding.fade_ticks
-        return BoardSetting(
-            stiffness=self._ratio * cap * cap * stiffness,
-            damping=self._ratio * cap * cap * damping,
-            level=cap * self._limit,
-            passing=cap * self._passing,
-            fade=own.period * int(ticks),
-        )
+        lines = self._gains(_LINES, own.scale * own.force_scale, own.force_limit, cap)
+        turns = self._gains(_TURNS, own.force_scale / own.scale, own.torque_limit, cap)
+        passing, fade = cap * self._passing, own.period * int(ticks)
+        if self._turns:
+            lines = turns
+        return BoardSetting(*lines, passing, fade, 0.0, *(turns if self._is_posed else ()))
+
+    def _gains(
+        self, names: tuple[str, str], ratio: float, limit: float, cap: float
+    ) -> tuple[float, float, float]:
+        """Returns stiffness, damping and level at the device along one kind of axis."""
+        coupling = self._coupling
+        gains = coupling["tuning_goal"] if coupling["tuning_ticks"][0] else coupling
+        stiffness, damping = (ratio * cap * cap * float(gains[name][0]) for name in names)
+        return stiffness, damping, cap * limit
 
     def take_notes(self) -> dict[str, Any] | None:
         """Returns the details of an event on the reports since the last call, or None."""
@@ -162,6 +190,8 @@ class OwnLoop:
             return None
         reports, self._reports = np.array(self._reports, REPORT_DTYPE), []
         counters = self._device.loop_report
-        told = {} if counters is None else {name: getattr(counters, name) for name in COUNTERS}
+        numbers = {} if counters is None else counters._asdict()
+        known = (*COUNTERS, *TEMPERATURES)
+        told = {name: numbers[name] for name in known if numbers.get(name) is not None}
         self.tally.add(reports, told)
         return {"reports": base64.b64encode(reports.tobytes()).decode(), **told}

@@ -313,7 +313,7 @@ class Session:
         self.probed: list[Probed | None] = [None] * len(self._setups)
         self._before_trip = np.empty(0, TICK_DTYPE)
         self._grants: tuple[Grant, ...] = ()
-        self._is_begun = self._is_held = self._has_warned = False
+        self._is_begun = self._is_held = self._has_warned = self._is_hot = False
         self.beside: SlowScene | PostedScene | None = None
         self.inputs: deque[list[Write]] = deque()
         limits = {each.scene.grip: each.coupling_limits for each in self._setups}
@@ -674,9 +674,15 @@ class Session:
         return self.tick + self._chore_ticks
 
     def _note_own_loop(self) -> None:
-        """Records what a loop of the device's own has reported since the last call."""
+        """Records what a loop of the device's own has reported; warns once of hot motors."""
         if self._own_loop is not None and (notes := self._own_loop.take_notes()):
             self.event(OWN_LOOP_EVENT, **notes)
+            account = self._own_loop.tally.account
+            if account.is_hot and not self._is_hot:
+                self._is_hot = True
+                warnings.warn(
+                    f"{self.device.info.name}: {account.heat}; let them rest", stacklevel=2
+                )
 
     def _note_shown(self) -> None:
         """Records what another program has shown since the last call."""

@@ -29,7 +29,9 @@ from hapticbridge.device.rawhid.protocol import (
     NAME_PAGE,
     NUMBERS_PAGE,
     VERSION,
+    Cause,
     GripNumbers,
+    LoopTurn,
     Numbers,
     State,
     Status,
@@ -173,10 +175,9 @@ def data_sheet(
     must = [*_MUST_SAY, *["force_limit"] * moves, *["torque_limit"] * turns]
     if missing := [field for field in must if known[field] is None]:
         raise DeviceError(f"{name} does not report its {missing[0]}, which is required")
-    delay = known.pop("delay")
-    known |= _own_loop(
-        name, known.pop("loop_rate"), known["loop_delay"], axes, has_grip=grip is not None
-    )
+    delay, loop_rate = known.pop("delay"), known.pop("loop_rate")
+    suits = grip is None and _loop_has(axes, is_posed=numbers.is_posed)
+    known |= _own_loop(name, loop_rate if suits else None, known["loop_delay"])
     values: dict[str, Any] = {} if grip is None else grip.known() | of_grip
     if missing := [each for each in _GRIP_MUST_SAY if each in values and values[each] is None]:
         raise DeviceError(f"{name} does not report its grip's {missing[0]}, which is required")
@@ -194,15 +195,22 @@ def data_sheet(
         raise DeviceError(f"{name} reports an impossible data sheet: {error}") from None
 
 
-def _own_loop(
-    name: str, rate: float | None, delay: float | None, axes: tuple[str, ...], *, has_grip: bool
-) -> dict[str, float | None]:
-    """Returns period and delay of a board's own loop, for a handle on lines or about one axis.
+def _loop_has(axes: tuple[str, ...], *, is_posed: bool) -> bool:
+    """Returns True for a handle on lines, about one axis, or about all where the loop has rotation.
+
+    The orientations of a handle about two axes are no rotation vectors of these two.
+    """
+    turns = sum(axis in AXES[3:] for axis in axes)
+    return turns in (0, 1, 3) if is_posed else turns == 0 or len(axes) == 1
+
+
+def _own_loop(name: str, rate: float | None, delay: float | None) -> dict[str, float | None]:
+    """Returns period and delay of a board's own loop; of none without a rate.
 
     Raises:
         DeviceError: The delay is unknown, with which the condition could not be judged.
     """
-    if not rate or has_grip or not (set(axes) <= set(AXES[:3]) or len(axes) == 1):
+    if not rate:
         return {"loop_period": None, "loop_delay": 0.0}
     if not delay:
         raise DeviceError(
@@ -224,6 +232,7 @@ class StateStream:
 
     Args:
         name: Name of the device in messages.
+        is_posed: True if states of the device's own loop have rotation, in a second frame.
 
     Attributes:
         newest: Newest state; None before the first.
@@ -233,8 +242,9 @@ class StateStream:
         repeated: Number of state frames that came twice.
     """
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self, name: str, *, is_posed: bool = False) -> None:
+        self._name, self._is_posed = name, is_posed
+        self._half: LoopState | None = None
         self.newest: State | LoopState | None = None
         self.report: LoopReport | None = None
         self.lost = self.damaged = self.repeated = 0
@@ -249,6 +259,17 @@ class StateStream:
         if isinstance(state, LoopReport):
             self.report = state
             return False
+        if isinstance(state, LoopState) and self._is_posed:
+            self._half = state
+            return False
+        if isinstance(state, LoopTurn):
+            if self._half is None or self._half.sequence != state.sequence:
+                return False  # its first frame was lost, which the sequence tells
+            state = self._half._replace(
+                rotation=state.rotation,
+                angular_velocity=state.angular_velocity,
+                torque=state.torque,
+            )
         if not isinstance(state, State | LoopState):
             self.damaged += state is None
             return False
@@ -272,6 +293,16 @@ FIRST_STATE_MS = 1000
 
 NO_WRENCH = (0.0,) * 6
 
+_FAULTS: dict[int, tuple[str, str]] = {
+    Cause.TEMPERATURE: ("that a motor or its driver is too hot", "let it cool, and home it"),
+    Cause.ENCODER: ("that an encoder is not read", "check its cable, restart and home it"),
+    Cause.DRIVER: (
+        "that a motor's driver has switched off",
+        "check its supply, restart and home it",
+    ),
+}
+"""Faults by their cause, each with a remedy."""
+
 
 class RawHidDevice:
     """A device that streams its state and applies the newest force frame.
@@ -290,6 +321,7 @@ class RawHidDevice:
 
     Attributes:
         info: Its data sheet.
+        is_posed: True if its own loop renders rotation beside lines.
         last_word: Commands zero force if this process dies or hangs; None if no second process
             can.
         states: Newest state, and numbers of lost and damaged frames.
@@ -309,8 +341,12 @@ class RawHidDevice:
     ) -> None:
         self._link, self._name, self._now = link, name, now
         self._sequence = 0
-        self.states = StateStream(name)
-        self.info = data_sheet(name, request_sheet(link, name), dict(changes or {}), round_trip)
+        pages = request_sheet(link, name)
+        self.is_posed = pages[0].is_posed
+        self.states = StateStream(name, is_posed=self.is_posed)
+        self.info = data_sheet(name, pages, dict(changes or {}), round_trip)
+        has_loop = pages[0].loop_rate > 0.0 and (changes or {}).get("loop_rate") != 0.0
+        self._has_idle_loop = has_loop and self.info.loop_period is None
         self._mask = np.array([float(axis in self.info.axes) for axis in AXES])
         self._has_grip = self.info.grip_axis is not None
         self._sample = np.zeros(1 + self._has_grip, SAMPLE_DTYPE)
@@ -330,7 +366,7 @@ class RawHidDevice:
         period = checked_period(period)
         self._watchdog_ms = min(math.ceil(1e3 * watchdog_time(period)), MAX_WATCHDOG_MS)
         self._has_begun = False
-        self.states = states = StateStream(self._name)
+        self.states = states = StateStream(self._name, is_posed=self.is_posed)
         self._link.take()
         for report in reports(self._link, FIRST_STATE_MS):
             if states.takes(report):
@@ -408,6 +444,14 @@ class RawHidDevice:
         with released(self._link, self.last_word):
             self._end_force()
 
+    def say_idle_loop(self, notify: Notify) -> None:
+        """Tells the user of a loop on the board that cannot render the axes of the device."""
+        if self._has_idle_loop:
+            notify(
+                f"the loop on the board of '{self.info.name}' does not render all of its axes; "
+                "the bridge's loop renders them"
+            )
+
     def _end_force(self) -> None:
         self._send(force_frame(self._next(), NO_WRENCH, 1, is_enabled=False))
 
@@ -423,7 +467,7 @@ class RawHidDevice:
         state = self.states.newest
         if state is None:
             return (0.0, 0.0, 0.0)
-        is_turned = isinstance(state, State) and not self.info.moves
+        is_turned = isinstance(state, State) and self._is_knob
         return state.numbers[3:6] if is_turned else state.numbers[:3]
 
     @property
@@ -445,7 +489,8 @@ class RawHidDevice:
         """
         if self.last_word is not None:
             self.last_word.beat(has_force=shown.is_enabled)
-        *surfaces, tool = show_frames(self._next(), shown, self._watchdog_ms)
+        frames = show_frames(self._next(), shown, self._watchdog_ms, is_posed=self.is_posed)
+        *surfaces, tool = frames
         for frame in surfaces:
             self._send(frame, _SURFACES)
         self._send(tool)
@@ -469,10 +514,14 @@ class RawHidDevice:
 
     def _refuse_fault(self, state: State | LoopState) -> None:
         if state.status & (Status.FAULT | Status.NOT_READY):
-            what = "a fault of its own" if state.status & Status.FAULT else "that its pose was lost"
+            what, remedy = "that its pose was lost", "restart and home it"
+            if state.status & Status.FAULT:
+                what, remedy = _FAULTS.get(
+                    state.status & Status.CAUSE, ("a fault of its own", remedy)
+                )
             raise DeviceError(
                 f"{self._name} reports {what} (status 0x{state.status:02x}) and gives no force; "
-                "restart and home it"
+                f"{remedy}"
             )
 
     def _fill(self, state: State | LoopState) -> None:
@@ -488,9 +537,13 @@ class RawHidDevice:
 
     def _in_place(self, state: State | LoopState) -> tuple[float, ...]:
         """Returns the numbers of a state; a loop's own are angles on a device that only turns."""
-        if isinstance(state, State) or self.info.moves:
+        if isinstance(state, State) or not self._is_knob:
             return state.numbers
         return (*state.numbers[3:6], *state.position, *state.numbers[3:6], *state.velocity)
+
+    @property
+    def _is_knob(self) -> bool:
+        return not (self.info.moves or self.is_posed)
 
     def _next(self) -> int:
         self._sequence = (self._sequence + 1) & 0xFFFF
@@ -506,7 +559,7 @@ class RawHidDevice:
 
 def open_rawhid(
     options: Mapping[str, object],
-    _notify: Notify,
+    notify: Notify,
     api: HidApi | None = None,
     now: Callable[[], float] = time.monotonic,
 ) -> RawHidDevice:
@@ -522,6 +575,7 @@ def open_rawhid(
     with opened(DRIVER, options, api, slots=SLOTS) as (plugged, link):
         device = RawHidDevice(link, str(plugged), changes, now)
     device.info = replace(device.info, serial=plugged.serial)
+    device.say_idle_loop(notify)
     if api is None:
         zero = b"\0" + force_frame(0, NO_WRENCH, 1, is_enabled=False)
         device.last_word = guard_device_node(plugged.path, zero)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from binascii import crc_hqx
+from collections.abc import Sequence
 from enum import IntEnum, IntFlag
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +15,7 @@ import numpy as np
 from hapticbridge.device.base import AXES
 from hapticbridge.device.driver import printable
 from hapticbridge.device.own_loop import SURFACES, BoardSetting, LoopReport, LoopState, ShownTool
+from hapticbridge.kernel.pose import canonical, quaternion_log
 
 DOCUMENT = Path(__file__).parents[1] / "rawhid.md"
 """Description of the protocol in this installation; the firmware is beside this module."""
@@ -43,7 +45,9 @@ class Kind(IntEnum):
         REPORT: From the device: counters of that loop.
         FORCE: To the device: a wrench.
         ASK: To the device: request for a page of the sheet.
+        LOOP_TURN: From the device: the rotation of that state.
         SETTING: To the device: gains of its loop.
+        POSE: To the device: a shown tool with its rotation.
         PLANES: To the device: more surfaces for the next shown tool.
         SHOW: To the device: a shown tool.
     """
@@ -52,9 +56,11 @@ class Kind(IntEnum):
     SHEET = 0x44
     LOOP = 0x4C
     REPORT = 0x52
+    LOOP_TURN = 0x55
     FORCE = 0x46
     ASK = 0x3F
     SETTING = 0x47
+    POSE = 0x54
     PLANES = 0x50
     SHOW = 0x59
 
@@ -69,6 +75,7 @@ class Status(IntFlag):
         FAULT: The device has detected a fault (encoder, driver, temperature) and gives no force.
         NOT_READY: The pose is not valid yet: the device must be homed or calibrated first.
         DAMAGED: A frame with a wrong CRC has come since the newest valid one.
+        CAUSE: Cause of the fault (``Cause``); 0 if it is not reported.
     """
 
     ENABLED = 1
@@ -77,6 +84,21 @@ class Status(IntFlag):
     FAULT = 8
     NOT_READY = 16
     DAMAGED = 32
+    CAUSE = 192
+
+
+class Cause(IntEnum):
+    """Cause of a fault, the bits ``Status.CAUSE``.
+
+    Attributes:
+        TEMPERATURE: A motor or its driver is too hot.
+        ENCODER: An encoder is not read.
+        DRIVER: A motor's driver has switched off.
+    """
+
+    TEMPERATURE = 64
+    ENCODER = 128
+    DRIVER = 192
 
 
 ENABLE = 1
@@ -85,6 +107,10 @@ ENABLE = 1
 HAS_VELOCITY, IS_PLACED, PLANE = 2, 4, 16
 """Byte 3 of a shown tool: its velocity is known, it was put there, and the factor of the number of
 surfaces."""
+
+SPEED_STEP, TURN_STEP = 1e-3, 1e-3
+"""Steps in m/s and rad/s of the velocities of a shown tool with its rotation. They reach 32 m/s and
+32 rad/s, finer ones less far. The tool is led for some ms by them."""
 
 NUMBERS_PAGE, NAME_PAGE, GRIP_PAGE = 0, 1, 2
 """Pages of the sheet, byte 3 of a frame that requests or holds one."""
@@ -95,13 +121,16 @@ _GRIP = struct.Struct("<BBBBHH7f26x")
 _NUMBERS = struct.Struct("<BBBBHH13f2x")
 _NAME = struct.Struct("<BBBBHH54s")
 _LOOP = struct.Struct("<BBBBHHI9fqfH")
-_REPORT = struct.Struct("<BBBBHH2q3I5f6x")
-_SETTING = struct.Struct("<BBBBHH5fq26x")
+_REPORT = struct.Struct("<BBBBHH2q3I6f2x")
+_SETTING = struct.Struct("<BBBBHH5fq3f14x")
 _SHOW = struct.Struct("<BBBBHH6fq4f6x")
+_POSE = struct.Struct("<BBBBHH6fq9hf")
+_LOOP_TURN = struct.Struct("<BBBBHH10f14x")
 _PLANES = struct.Struct("<BBBBHH8f22x")
 _CRC = struct.Struct("<H")
 
 _PICOJOULES, _MICRONEWTONS = 1e12, 1e6
+_LARGEST_SHORT = 32767
 
 
 class State(NamedTuple):
@@ -139,11 +168,26 @@ def _known(values: dict[str, float]) -> dict[str, float | None]:
     }
 
 
+class LoopTurn(NamedTuple):
+    """Rotation of the device while its own loop renders it, the second half of a ``LoopState``.
+
+    Attributes:
+        sequence: That of the state.
+        rotation, angular_velocity, torque: As of ``LoopState``.
+    """
+
+    sequence: int
+    rotation: tuple[float, ...]
+    angular_velocity: tuple[float, ...]
+    torque: tuple[float, ...]
+
+
 class Numbers(NamedTuple):
     """Page 0 of the device's data sheet; NaN for unknown numbers.
 
     Attributes:
-        axes: Bit i is set if it has axis i of ``AXES``, bit 6 if it has a grip axis.
+        axes: Bit i is set if it has axis i of ``AXES``, bit 6 if it has a grip axis, bit 7 if its
+            own loop renders rotation beside lines.
         rate: Rate of state frames in Hz.
         mass: Mass in kg.
         damping: Damping in N s/m.
@@ -190,6 +234,11 @@ class Numbers(NamedTuple):
     def has_grip(self) -> bool:
         """True if it has a grip axis."""
         return bool(self.axes >> len(AXES) & 1)
+
+    @property
+    def is_posed(self) -> bool:
+        """True if its own loop renders rotation beside lines."""
+        return bool(self.axes >> len(AXES) + 1 & 1)
 
 
 class GripNumbers(NamedTuple):
@@ -240,8 +289,14 @@ def ask_frame(sequence: int, page: int) -> bytes:
     return _sealed(_FORCE.pack(MAGIC, VERSION, Kind.ASK, page, sequence, 0, *[0.0] * 7))
 
 
-def show_frames(sequence: int, shown: ShownTool, patience_ms: int) -> tuple[bytes, ...]:
-    """Returns the frames that show a tool; the force fades ``patience_ms`` after the last one."""
+def show_frames(
+    sequence: int, shown: ShownTool, patience_ms: int, *, is_posed: bool = False
+) -> tuple[bytes, ...]:
+    """Returns the frames that show a tool; the force fades ``patience_ms`` after the last one.
+
+    ``is_posed`` is true for a loop that renders rotation. Its velocities are rounded, and end at 32
+    m/s and 32 rad/s.
+    """
     option = (
         ENABLE * shown.is_enabled
         + HAS_VELOCITY * (shown.velocity is not None)
@@ -251,9 +306,18 @@ def show_frames(sequence: int, shown: ShownTool, patience_ms: int) -> tuple[byte
     planes = [number for normal, gap in shown.surfaces for number in (*normal, gap)]
     planes += [0.0] * (4 * SURFACES - len(planes))
     velocity = shown.velocity or (0.0,) * 3
-    head = MAGIC, VERSION, Kind.SHOW, option, sequence, patience_ms
+    head = MAGIC, VERSION, Kind.POSE if is_posed else Kind.SHOW, option, sequence, patience_ms
     work = round(_PICOJOULES * shown.work)
-    frame = _sealed(_SHOW.pack(*head, *shown.position, *velocity, work, *planes[:4]))
+    if is_posed:
+        shorts = [
+            *_shorts(velocity, SPEED_STEP),
+            *_shorts(shown.angular_velocity, TURN_STEP),
+            *_shorts(planes[:3], 1.0 / _LARGEST_SHORT),
+        ]
+        body = _POSE.pack(*head, *shown.position, *shown.rotation, work, *shorts, planes[3])
+    else:
+        body = _SHOW.pack(*head, *shown.position, *velocity, work, *planes[:4])
+    frame = _sealed(body)
     if len(shown.surfaces) < 2:
         return (frame,)
     others = _PLANES.pack(MAGIC, VERSION, Kind.PLANES, 0, sequence, 0, *planes[4:])
@@ -264,7 +328,13 @@ def setting_frame(sequence: int, setting: BoardSetting) -> bytes:
     """Returns the frame with the gains of a loop on the board."""
     head = MAGIC, VERSION, Kind.SETTING, 0, sequence, 0
     credit = round(_PICOJOULES * setting.credit)
-    return _sealed(_SETTING.pack(*head, *setting[:5], credit))
+    return _sealed(_SETTING.pack(*head, *setting[:5], credit, *setting[6:]))
+
+
+def _shorts(numbers: Sequence[float], step: float) -> list[int]:
+    """Returns numbers in steps, as 16 bits hold them."""
+    most = _LARGEST_SHORT
+    return [round(max(min(number / step, most), -most)) for number in numbers]
 
 
 def _sealed(body: bytes) -> bytes:
@@ -279,7 +349,7 @@ def version_of(frame: bytes) -> int | None:
     return frame[1] if crc16(frame[:-2]) == crc else None
 
 
-Answer = State | LoopState | LoopReport | Numbers | GripNumbers | str
+Answer = State | LoopState | LoopTurn | LoopReport | Numbers | GripNumbers | str
 """Anything that a device sends."""
 
 
@@ -311,8 +381,14 @@ def decoded(frame: bytes) -> Answer | None:
             tank=tank,
             echo=echo,
         )
+    if kind == Kind.LOOP_TURN:
+        sequence, _, *numbers = _LOOP_TURN.unpack_from(frame)[4:]
+        w, x, y, z = numbers[:4]
+        is_rotation = 0.5 < w * w + x * x + y * y + z * z < 2.0
+        turn = quaternion_log(canonical((w, x, y, z))) if is_rotation else (math.nan,) * 3
+        return LoopTurn(sequence, turn, tuple(numbers[4:7]), tuple(numbers[7:]))
     if kind == Kind.REPORT:
-        sequence, _, changes, work, held_back, ticks, missed, share, heat, *tool = (
+        sequence, _, changes, work, held_back, ticks, missed, share, heat, *tool, limit = (
             _REPORT.unpack_from(frame)[4:]
         )
         return LoopReport(
@@ -323,7 +399,8 @@ def decoded(frame: bytes) -> Answer | None:
             ticks,
             missed,
             share,
-            temperature=heat,
+            temperature=heat if math.isfinite(heat) else None,
+            temperature_limit=limit if math.isfinite(limit) and limit > 0.0 else None,
             tool=tuple(tool),
         )
     return _page(frame) if kind == Kind.SHEET else None

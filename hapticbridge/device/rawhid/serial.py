@@ -434,6 +434,7 @@ def open_serial(
         device = RawHidDevice(link, str(plugged), changes, source.now, round_trip)
     notify(f"{plugged.path} at {baud} baud: a force is confirmed within {1e3 * round_trip:.1f} ms")
     device.info = replace(device.info, serial=plugged.serial)
+    device.say_idle_loop(notify)
     if ports is None:
         zero = force_frame(0, NO_WRENCH, 1, is_enabled=False)
         device.last_word = guard_device_node(plugged.path, zero)

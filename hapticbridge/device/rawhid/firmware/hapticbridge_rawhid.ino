@@ -3,7 +3,7 @@
 // direction pin. It runs a loop of its own at 10 kHz for a host that shows its tool, and follows
 // forces of a host that sends them.
 //
-// Tools > USB Type > Raw HID. Files: this sketch, the five of the name hb_*.h and hb_protocol.cpp
+// Tools > USB Type > Raw HID. Files: this sketch, the six of the name hb_*.h and hb_protocol.cpp
 // in one folder named hapticbridge_rawhid. Needs only Teensyduino (its Encoder library and
 // IntervalTimer). Then, on the computer: hapticbridge devices
 //
@@ -95,4 +95,5 @@ void loop() {
   const uint16_t buttons = PIN_BUTTON != 255 && digitalRead(PIN_BUTTON) == LOW ? 1 : 0;
   // with HB_FAULT if your driver has a fault pin, with HB_NOT_READY while a device must be homed
   if (device.state(buttons, motor.status(), frame)) RawHID.send(frame, 0);
+  if (device.more(frame)) RawHID.send(frame, 0);  // of a loop that renders rotation
 }

@@ -4,7 +4,7 @@
 // of a host that sends them. A Hapkit (ATmega328 at 16 MHz) is too slow for the loop: it follows
 // forces alone.
 //
-// Files: this sketch, the five of the name hb_*.h and hb_protocol.cpp in one folder named
+// Files: this sketch, the six of the name hb_*.h and hb_protocol.cpp in one folder named
 // hapticbridge_serial. The Hapkit's board is an Arduino Uno. Then, on the computer:
 // hapticbridge devices
 //
@@ -108,5 +108,8 @@ void loop() {
   while (Serial.available() > 0) device.receive_byte((uint8_t)Serial.read());
   while (sent < HB_FRAME_BYTES && Serial.availableForWrite() > 0) Serial.write(outgoing[sent++]);
   if (sent < HB_FRAME_BYTES) return;
-  if (device.answer(outgoing) || device.state(0, motor.status(), outgoing)) sent = 0;
+  if (device.more(outgoing) || device.answer(outgoing) ||
+      device.state(0, motor.status(), outgoing)) {
+    sent = 0;
+  }
 }

@@ -9,7 +9,11 @@
 //   }
 //   board.receive(frame, micros());          // as of HbDevice, in the main loop
 //   if (board.answer(frame)) send(frame);
-//   if (board.state(motion, micros(), frame)) send(frame);
+//   board.state(motion, micros(), frame); send(frame);
+//   if (board.more(frame)) send(frame);
+//
+// An HbPoseBoard renders rotation about up to three axes beside lines. Its tick() takes the handle's
+// rotation as a quaternion, too, and gives a torque in N m. Each of its states takes two frames.
 //
 // Define HB_LOCK and HB_UNLOCK before this file where noInterrupts() and interrupts() are others.
 //
@@ -30,20 +34,22 @@ static const uint8_t HB_REPORT_EVERY = 32;
 // Time between two periods, in T, up to which a timer is not slow: clocks differ by less.
 static const float HB_SLOW = 1.01f;
 
-class HbBoard {
+template <bool TURNS>
+class HbBoardOf {
  public:
   // Creates a board without a force; `period` is T in s.
-  HbBoard(const HbSheet& sheet, float period)
-      : device_(with_rate(sheet, period)),
+  HbBoardOf(const HbSheet& sheet, float period)
+      : device_(with_loop(sheet, period)),
         loop_(period),
         period_us_(1e6f * period),
         late_us_(0.0f),
         last_us_(0),
         is_loop_(false),
         is_unfit_(false),
+        has_more_(false),
         frames_(0) {
     memset(&pace_, 0, sizeof pace_);
-    pace_.temperature = NAN;
+    set_temperature(NAN, NAN);
   }
 
   // Decodes one report from the host, as HbDevice does, and gives its order to the loop.
@@ -70,6 +76,7 @@ class HbBoard {
     const HbPace pace = pace_;
     is_unfit_ = (motion.status & (HB_FAULT | HB_NOT_READY)) != 0;
     HB_UNLOCK();
+    has_more_ = false;
     if (!device_.is_loop()) {
       device_.state(motion, now_us, frame);
       HB_LOCK();
@@ -80,37 +87,60 @@ class HbBoard {
       device_.loop_report(report, pace, frame);
     } else {
       device_.loop_state(motion, report, now_us, frame);
+      has_more_ = TURNS;
+      if (TURNS) device_.loop_turn(motion, report, more_);
     }
   }
 
-  // Runs one period, in the timer's interrupt: `position` of the handle in m to `force` in N, or angles
-  // in rad to torques in N m of a device that only turns.
+  // Fills in the second frame of the last state; returns false if there is none.
+  bool more(uint8_t frame[HB_FRAME_BYTES]) {
+    if (has_more_) memcpy(frame, more_, sizeof more_);
+    const bool had_more = has_more_;
+    has_more_ = false;
+    return had_more;
+  }
+
+  // Runs one period, in the timer's interrupt: `position` of the handle in m to `force` in N, or
+  // angles in rad to torques in N m of a device that only turns about one axis.
   void tick(const float position[3], uint32_t now_us, float force[3]) {
+    tick(position, 0, now_us, force, 0);
+  }
+
+  // Runs one period of an HbPoseBoard: position in m and quaternion to force in N and torque in N m.
+  void tick(const float position[3], const float rotation[4], uint32_t now_us, float force[3],
+            float torque[3]) {
     if (pace_.ticks++ > 0) keep_pace((float)(now_us - last_us_));
     last_us_ = now_us;
     if (!is_loop_ || is_unfit_) loop_.end();  // or its spring would be stretched without a force
-    loop_.tick(position, force);
+    loop_.tick(position, rotation, force, torque);
     if (is_loop_) return;
     const HbWrench wrench = command_.wrench(now_us);
     memcpy(force, device_.turns() ? wrench.torque : wrench.force, 3 * sizeof(float));
+    if (TURNS) memcpy(torque, wrench.torque, 3 * sizeof(float));
   }
 
   // True if the device only turns.
   bool turns() const { return device_.turns(); }
 
-  // Copies the position of the last period.
-  void latched(float position[3]) const {
+  // Copies the position of the last period, and of an HbPoseBoard the quaternion.
+  void latched(float position[3], float rotation[4]) const {
     HB_LOCK();
     memcpy(position, loop_.report().position, 3 * sizeof(float));
+    if (TURNS) memcpy(rotation, loop_.report().rotation, 4 * sizeof(float));
     HB_UNLOCK();
   }
 
-  // Temperature of the motors in degrees Celsius, for the host.
-  void set_temperature(float temperature) { pace_.temperature = temperature; }
+  // Sets the temperature of the motors in degrees Celsius, and the one at which the sketch sets
+  // HB_FAULT_TEMPERATURE, for the host.
+  void set_temperature(float temperature, float limit) {
+    pace_.temperature = temperature;
+    pace_.temperature_limit = limit;
+  }
 
  private:
-  static HbSheet with_rate(HbSheet sheet, float period) {
+  static HbSheet with_loop(HbSheet sheet, float period) {
     sheet.loop_rate = 1.0f / period;
+    if (TURNS) sheet.axes |= HB_POSE;
     return sheet;
   }
 
@@ -133,14 +163,18 @@ class HbBoard {
   }
 
   HbDevice device_;
-  HbLoop loop_;
+  HbLoopOf<TURNS> loop_;
   HbCommand command_;
   HbPace pace_;
   const float period_us_;
   float late_us_;  // behind the timer's due time, as far as no missed period counts for it
   uint32_t last_us_;
-  bool is_loop_, is_unfit_;
+  bool is_loop_, is_unfit_, has_more_;
   uint8_t frames_;
+  uint8_t more_[TURNS ? HB_FRAME_BYTES : 1];
 };
+
+typedef HbBoardOf<false> HbBoard;
+typedef HbBoardOf<true> HbPoseBoard;
 
 #endif

@@ -5,6 +5,9 @@
 //   loop.show(shown);                        // when the host has shown its tool
 //   loop.tick(position, force);              // in the interrupt: position in m -> force in N
 //
+//   HbPoseLoop loop(1e-4f);                  // with rotation about up to three axes
+//   loop.tick(position, rotation, force, torque);
+//
 // In each period, with the handle at h, the tool shown at y, e = h - y, and all in the device's
 // frame, the force on the tool is
 //
@@ -20,7 +23,12 @@
 // sum P + V on a device of b >= K T/2 + B, whatever the host shows, and however late. The time t from
 // reading a position to its force counts, too: b >= K (T/2 + 3 t/2) + B is enough up to t = T.
 //
-// An HbLoop belongs to one interrupt. What a main loop receives for it is copied with interrupts off.
+// An HbPoseLoop has such a coupling of rotations beside it, with e the rotation vector from the
+// tool to the handle and dh, dy those of their motions; planes stop the tool's motion along lines
+// alone. A rotation's V is convex up to half a turn. Near and beyond it P is the least of f . dy and
+// what the spring and its damper give.
+//
+// A loop belongs to one interrupt. What a main loop receives for it is copied with interrupts off.
 //
 // Licence: Apache-2.0, as the rest of hapticbridge.
 #ifndef HB_LOOP_H
@@ -31,6 +39,7 @@
 #include <string.h>
 
 #include "hb_constants.h"
+#include "hb_rotation.h"
 
 // Energy in pJ: sums of it are exact, and need no unit for double precision.
 typedef int64_t HbEnergy;
@@ -55,7 +64,7 @@ inline float hb_joules(HbEnergy energy) {
   return 0.065535e-6f * (float)(int32_t)(coarse < 0x7FFFFFFF ? coarse : 0x7FFFFFFF);
 }
 
-// Gains of the coupling in the device's frame.
+// Gains of a coupling in the device's frame; of rotations in N m/rad, N m s/rad and N m.
 struct HbGains {
   float stiffness;  // K in N/m
   float damping;    // B in N s/m
@@ -76,11 +85,14 @@ struct HbShown {
   uint8_t planes;     // of plane
   bool has_velocity;  // without one the tool is led to the position within the time between two
   HbPlane plane[HB_PLANES];
+  float rotation[4];  // quaternion (w, x, y, z), of an HbPoseLoop alone
+  float turning[3];   // rad/s
 };
 
 // How the host wants the loop to be.
 struct HbSetting {
   HbGains gains;
+  HbGains turn_gains;  // of rotations, of an HbPoseLoop alone
   HbEnergy credit;  // E in pJ, given once, when the force first begins
   float passing;    // energy in J that may be under way between two shows
   float fade;       // s, in which the force rises, fades, and gains change
@@ -99,25 +111,37 @@ struct HbReport {
   float force[3];      // on the device in N
   float share;         // of the gains in force, 0 to 1
   bool is_faulty;      // a position was no place: no force until the board restarts
+  // of an HbPoseLoop
+  float rotation[4];   // of the handle
+  float tool_turn[4];  // rotation of the shown tool
+  float torque[3];     // on the device in N m
 };
+
+// Sum of the squares of two angles in rad up to which their sum is at most half a turn, pi^2/2.
+static const float HB_CONVEX = 4.9348f;
 
 // How well the timer keeps the period.
 struct HbPace {
-  uint32_t ticks;     // periods so far
-  uint32_t missed;    // of them, those that came a period late or more
-  float temperature;  // degrees Celsius of the motors; NAN if unknown
+  uint32_t ticks;           // periods so far
+  uint32_t missed;          // of them, those that came a period late or more
+  float temperature;        // degrees Celsius of the motors; NAN if unknown
+  float temperature_limit;  // at which they are switched off; NAN if unknown
 };
 
-class HbLoop {
+template <bool TURNS>
+class HbLoopOf {
  public:
   // Creates a loop without a force; `period` is T in s.
-  explicit HbLoop(float period)
+  explicit HbLoopOf(float period)
       : period_(period), rate_(1.0f / period), share_(0.0f), has_started_(false), has_credit_(false) {
     memset(&setting_, 0, sizeof setting_);
     memset(&shown_, 0, sizeof shown_);
     memset(&report_, 0, sizeof report_);
     memset(velocity_, 0, sizeof velocity_);
+    memset(turning_, 0, sizeof turning_);
     gains_ = earlier_ = setting_.gains;
+    turn_gains_ = earlier_turn_ = setting_.turn_gains;
+    report_.rotation[0] = report_.tool_turn[0] = 1.0f;
     moved_ = 1.0f;
     scene_work_ = cap_ = 0;
     age_ = silence_ = 0;
@@ -128,14 +152,20 @@ class HbLoop {
 
   // Sets gains and times; the gains move there within `fade`.
   void set(const HbSetting& setting) {
-    if (memcmp(&setting.gains, &setting_.gains, sizeof setting.gains) != 0) {
+    if (memcmp(&setting.gains, &setting_.gains, sizeof setting.gains) != 0 ||
+        memcmp(&setting.turn_gains, &setting_.turn_gains, sizeof setting.turn_gains) != 0) {
       earlier_ = gains_;
+      earlier_turn_ = turn_gains_;
       moved_ = 0.0f;
     }
     setting_ = setting;
-    // the tank holds twice what the spring has at its level, F^2/2K, and what is under way
+    // the tank holds twice what the springs have at their levels, F^2/2K, and what is under way
     const HbGains& gains = setting.gains;
-    const float held = gains.stiffness > 0.0f ? gains.level * gains.level / gains.stiffness : 0.0f;
+    const HbGains& turn = setting.turn_gains;
+    float held = gains.stiffness > 0.0f ? gains.level * gains.level / gains.stiffness : 0.0f;
+    if (TURNS && turn.stiffness > 0.0f) {
+      held += 2.0f * energy(turn, fminf(turn.level / turn.stiffness, HB_HALF_TURN));
+    }
     cap_ = hb_picojoules(held + setting.passing);
   }
 
@@ -145,7 +175,7 @@ class HbLoop {
     setting_.is_enabled = false;
     share_ = 0.0f;
     memset(&gains_, 0, sizeof gains_);
-    earlier_ = gains_;
+    earlier_ = turn_gains_ = earlier_turn_ = gains_;
     if (report_.tank > 0) report_.tank = 0;
     has_shown_ = false;
   }
@@ -167,57 +197,66 @@ class HbLoop {
     age_ = silence_ = 0;
     is_placed_ = is_placed_ || is_new;
     has_shown_ = true;
+    if (TURNS) memcpy(from_turn_, shown.rotation, sizeof from_turn_);
     if (shown.has_velocity) {
       copy(from_, shown.position);
       copy(velocity_, shown.velocity);
+      copy(turning_, shown.turning);
       horizon_ = HB_LONGEST * since;
       lead_ = 0.0f;
       return;
     }
     copy(from_, report_.tool);
     for (int i = 0; i < 3; i++) velocity_[i] = (shown.position[i] - from_[i]) / since;
+    if (TURNS) {
+      memcpy(from_turn_, report_.tool_turn, sizeof from_turn_);
+      hb_turn(from_turn_, shown.rotation, turning_);
+      for (int i = 0; i < 3; i++) turning_[i] /= since;
+    }
     horizon_ = since;
     lead_ = period_;
   }
 
   // Runs one period: `position` of the handle in m to `force` on the device in N.
-  void tick(const float position[3], float force[3]) {
-    float step[3], moved[3], u[3];
-    report_.is_faulty = report_.is_faulty || !is_place(position);
+  void tick(const float position[3], float force[3]) { tick(position, 0, force, 0); }
+
+  // Runs one period of an HbPoseLoop: position in m and quaternion to force in N and torque in N m.
+  void tick(const float position[3], const float rotation[4], float force[3], float torque[3]) {
+    Goal goal;
+    Motion motion;
+    if (!is_place(position) || (TURNS && !hb_is_rotation(rotation))) report_.is_faulty = true;
     if (report_.is_faulty) {
       memset(force, 0, 3 * sizeof(float));
       memset(report_.force, 0, sizeof report_.force);
+      if (TURNS) {
+        memset(torque, 0, 3 * sizeof(float));
+        memset(report_.torque, 0, sizeof report_.torque);
+      }
       return;
     }
-    if (!has_started_) {
-      copy(report_.position, position);
-      copy(report_.tool, position);
-      has_started_ = true;
-    }
-    subtract(position, report_.position, handle_step_);
-    copy(report_.position, position);
+    take(position, rotation);
     change_gains();
-    aim(step);
-    if (!is_place(step)) copy(step, report_.tool);
-    subtract(step, report_.tool, step);
+    aim(goal);
     float share = 1.0f;
     const float least = -hb_joules(report_.tank);
-    float released = given(1.0f, step, moved, u);
+    float released = given(1.0f, goal, motion);
     if (released < least) {
       report_.held_back++;
-      share = paid(step, released, least);
-      released = given(share, step, moved, u);
+      share = paid(goal, released, least);
+      released = given(share, goal, motion);
       if (released < least) {  // by rounding
         share = 0.0f;
-        released = given(share, step, moved, u);
+        released = given(share, goal, motion);
       }
     }
     float change = 0.0f;
     for (int i = 0; i < 3; i++) {
-      report_.tool[i] += moved[i];
-      change += fabsf(-u[i] - report_.force[i]);
-      force[i] = report_.force[i] = -u[i];
+      report_.tool[i] += motion.moved[i];
+      change += fabsf(-motion.u[i] - report_.force[i]);
+      force[i] = report_.force[i] = -motion.u[i];
+      if (TURNS) torque[i] = report_.torque[i] = -motion.torque[i];
     }
+    if (TURNS) memcpy(report_.tool_turn, motion.rotation, sizeof report_.tool_turn);
     report_.changes += (int32_t)(1e6f * change);
     const HbEnergy passed = hb_picojoules(released);
     report_.passed += passed;
@@ -230,6 +269,16 @@ class HbLoop {
   const HbReport& report() const { return report_; }
 
  private:
+  // Way of the tool to y*, the rotation there, and the rotation's V in J before.
+  struct Goal {
+    float step[3], turn[3], rotation[4], held;
+  };
+
+  // Motion of the tool as it is rounded, and what the coupling gives to it: f in N, torque in N m.
+  struct Motion {
+    float moved[3], u[3], turned[3], torque[3], rotation[4];
+  };
+
   static HbEnergy positive(HbEnergy energy) { return energy > 0 ? energy : 0; }
 
   static void copy(float to[3], const float from[3]) { memcpy(to, from, 3 * sizeof(float)); }
@@ -269,6 +318,30 @@ class HbLoop {
     return gains.level / gains.stiffness + (energy - elastic) / gains.level;
   }
 
+  // Takes the handle's pose, and its motion since the last one.
+  void take(const float position[3], const float rotation[4]) {
+    float turn[4];
+    if (TURNS) {
+      memcpy(turn, rotation, sizeof turn);
+      hb_normalize(turn);
+    }
+    if (!has_started_) {
+      copy(report_.position, position);
+      copy(report_.tool, position);
+      if (TURNS) {
+        memcpy(report_.rotation, turn, sizeof turn);
+        memcpy(report_.tool_turn, turn, sizeof turn);
+      }
+      has_started_ = true;
+    }
+    subtract(position, report_.position, handle_step_);
+    copy(report_.position, position);
+    if (TURNS) {
+      hb_turn(report_.rotation, turn, handle_turn_);
+      memcpy(report_.rotation, turn, sizeof turn);
+    }
+  }
+
   // Moves the gains on; where their spring would gain energy, the shown tool slips to the handle.
   void change_gains() {
     const bool is_on = setting_.is_enabled && has_shown_ && !is_placed_ &&
@@ -280,73 +353,153 @@ class HbLoop {
     }
     share_ = is_on ? fminf(share_ + pace, 1.0f) : fmaxf(share_ - pace, 0.0f);
     if (is_placed_ && share_ == 0.0f) is_placed_ = false;
-    const HbGains before = gains_;
+    const HbGains before = gains_, turn_before = turn_gains_;
     // all in proportion: between two couplings that the device bears lie only such
     moved_ = fminf(moved_ + pace, 1.0f);
-    gains_.stiffness = between(earlier_.stiffness, setting_.gains.stiffness);
-    gains_.damping = between(earlier_.damping, setting_.gains.damping);
-    gains_.level = between(earlier_.level, setting_.gains.level);
+    blend(earlier_, setting_.gains, gains_);
+    if (TURNS) blend(earlier_turn_, setting_.turn_gains, turn_gains_);
     report_.share = share_;
-    if (gains_.stiffness <= before.stiffness && gains_.level <= before.level) return;
-    float stretch[3];
-    subtract(report_.position, report_.tool, stretch);
+    if (is_raised(before, gains_)) {
+      float stretch[3];
+      subtract(report_.position, report_.tool, stretch);
+      const float kept = kept_share(before, gains_, stretch);
+      if (kept < 1.0f) {
+        for (int i = 0; i < 3; i++) report_.tool[i] = report_.position[i] - kept * stretch[i];
+      }
+    }
+    if (TURNS && is_raised(turn_before, turn_gains_)) {
+      float twist[3];
+      hb_turn(report_.tool_turn, report_.rotation, twist);
+      const float slip = 1.0f - kept_share(turn_before, turn_gains_, twist);
+      for (int i = 0; i < 3; i++) twist[i] *= slip;
+      if (slip > 0.0f) hb_turned(twist, report_.tool_turn, report_.tool_turn);
+    }
+  }
+
+  static bool is_raised(const HbGains& before, const HbGains& now) {
+    return now.stiffness > before.stiffness || now.level > before.level;
+  }
+
+  // Returns the share of a stretch at which a spring holds no more than under its gains before.
+  static float kept_share(const HbGains& before, const HbGains& now, const float stretch[3]) {
     const float length = sqrtf(dot(stretch, stretch));
     const float held = energy(before, length);
-    if (length <= 0.0f || energy(gains_, length) <= held) return;
-    const float kept = length_of(gains_, held) / length;
-    for (int i = 0; i < 3; i++) report_.tool[i] = report_.position[i] - kept * stretch[i];
+    if (length <= 0.0f || energy(now, length) <= held) return 1.0f;
+    return length_of(now, held) / length;
+  }
+
+  void blend(const HbGains& earlier, const HbGains& goal, HbGains& now) const {
+    now.stiffness = between(earlier.stiffness, goal.stiffness);
+    now.damping = between(earlier.damping, goal.damping);
+    now.level = between(earlier.level, goal.level);
   }
 
   float between(float earlier, float goal) const {
     return (1.0f - moved_) * earlier + moved_ * share_ * goal;
   }
 
-  // Finds y*: where the tool is by now, moved out of the planes.
-  void aim(float goal[3]) const {
+  // Finds y*: where the tool is by now, moved out of the planes. A goal at no place is where it is.
+  void aim(Goal& goal) const {
+    float place[3];
+    if (TURNS) memcpy(goal.rotation, report_.tool_turn, sizeof goal.rotation);
     if (!has_shown_) {
-      copy(goal, report_.tool);
-      return;
+      copy(place, report_.tool);
+    } else {
+      const float time = fminf((float)age_ * period_ + lead_, horizon_);
+      for (int i = 0; i < 3; i++) place[i] = from_[i] + time * velocity_[i];
+      leave_planes(place);
+      if (!is_place(place)) copy(place, report_.tool);
+      if (TURNS) {
+        float turn[3];
+        for (int i = 0; i < 3; i++) turn[i] = time * turning_[i];
+        if (is_place(turn)) hb_turned(turn, from_turn_, goal.rotation);
+      }
     }
-    const float time = fminf((float)age_ * period_ + lead_, horizon_);
-    for (int i = 0; i < 3; i++) goal[i] = from_[i] + time * velocity_[i];
+    subtract(place, report_.tool, goal.step);
+    if (TURNS) {
+      float twist[3];
+      hb_turn(report_.tool_turn, report_.rotation, twist);
+      goal.held = energy(turn_gains_, sqrtf(dot(twist, twist)));
+      hb_turn(report_.tool_turn, goal.rotation, goal.turn);
+    }
+  }
+
+  void leave_planes(float place[3]) const {
     for (int round = 0; round < 4; round++) {
       bool has_moved = false;
       for (int k = 0; k < shown_.planes; k++) {
         const HbPlane& plane = shown_.plane[k];
         float moved[3];
-        subtract(goal, shown_.position, moved);
+        subtract(place, shown_.position, moved);
         const float inside = -plane.gap - dot(plane.normal, moved);
         if (inside <= 0.0f) continue;
-        for (int i = 0; i < 3; i++) goal[i] += inside * plane.normal[i];
+        for (int i = 0; i < 3; i++) place[i] += inside * plane.normal[i];
         has_moved = true;
       }
       if (!has_moved) return;
     }
   }
 
-  // Returns P in J if the tool moves by a share of a step; `u` is f in N, `moved` the motion in m as
-  // it is rounded.
-  float given(float share, const float step[3], float moved[3], float u[3]) const {
+  // Returns P in J if the tool moves by a share of the way to its goal.
+  float given(float share, const Goal& goal, Motion& motion) const {
     const float damped = gains_.damping * rate_;
     for (int i = 0; i < 3; i++) {
-      const float tool = report_.tool[i] + share * step[i];
-      moved[i] = tool - report_.tool[i];
-      u[i] = gains_.stiffness * (report_.position[i] - tool) + damped * (handle_step_[i] - moved[i]);
+      const float tool = report_.tool[i] + share * goal.step[i];
+      motion.moved[i] = tool - report_.tool[i];
+      motion.u[i] = gains_.stiffness * (report_.position[i] - tool) +
+                    damped * (handle_step_[i] - motion.moved[i]);
     }
-    const float size = sqrtf(dot(u, u));
-    if (size > gains_.level) {
-      const float ratio = gains_.level / size;
-      for (int i = 0; i < 3; i++) u[i] *= ratio;
-    }
-    return dot(u, moved);
+    limit(motion.u, gains_.level);
+    const float work = dot(motion.u, motion.moved);
+    return TURNS ? work + given_by_turn(share, goal, motion) : work;
   }
 
-  // Returns a share of the step for which the tank pays. Below the level P is a parabola of the
+  // Returns the part of P that rotation has.
+  float given_by_turn(float share, const Goal& goal, Motion& motion) const {
+    if (share == 1.0f) {
+      memcpy(motion.rotation, goal.rotation, sizeof motion.rotation);
+    } else if (share == 0.0f) {
+      memcpy(motion.rotation, report_.tool_turn, sizeof motion.rotation);
+    } else {
+      float turn[3];
+      for (int i = 0; i < 3; i++) turn[i] = share * goal.turn[i];
+      hb_turned(turn, report_.tool_turn, motion.rotation);
+    }
+    hb_turn(report_.tool_turn, motion.rotation, motion.turned);
+    float twist[3], elastic[3];
+    hb_turn(motion.rotation, report_.rotation, twist);
+    const float damped = turn_gains_.damping * rate_;
+    for (int i = 0; i < 3; i++) {
+      elastic[i] = turn_gains_.stiffness * twist[i];
+      motion.torque[i] = elastic[i] + damped * (handle_turn_[i] - motion.turned[i]);
+    }
+    limit(motion.torque, turn_gains_.level);
+    const float work = dot(motion.torque, motion.turned);
+    // within half a turn V is convex, and falls by more than the torque's work
+    if (dot(twist, twist) + dot(motion.turned, motion.turned) < HB_CONVEX) return work;
+    float damper[3];
+    limit(elastic, turn_gains_.level);
+    subtract(motion.torque, elastic, damper);
+    const float fallen = goal.held - energy(turn_gains_, sqrtf(dot(twist, twist)));
+    return fminf(work, fallen + dot(damper, motion.turned));
+  }
+
+  // Makes a force or torque one of at most a level.
+  static void limit(float u[3], float level) {
+    const float size = sqrtf(dot(u, u));
+    if (size > level) {
+      const float ratio = level / size;
+      for (int i = 0; i < 3; i++) u[i] *= ratio;
+    }
+  }
+
+  // Returns a share of the way for which the tank pays. Below the level P is a parabola of the
   // share, a r - c r^2; elsewhere smaller shares are tried.
-  float paid(const float step[3], float last_given, float least) const {
-    float moved[3], u[3], share = 0.0f, high = 1.0f, last = 1.0f, trial = 0.5f;
+  float paid(const Goal& goal, float last_given, float least) const {
+    Motion motion;
+    float share = 0.0f, high = 1.0f, last = 1.0f, trial = 0.5f;
     for (int k = 0; k < HB_TRIALS; k++) {
-      const float released = given(trial, step, moved, u);
+      const float released = given(trial, goal, motion);
       if (released < least) {
         high = trial;
       } else {
@@ -371,13 +524,18 @@ class HbLoop {
   const float period_, rate_;
   HbSetting setting_;
   HbGains gains_, earlier_;  // in force, and when they were set anew
+  HbGains turn_gains_, earlier_turn_;
   HbShown shown_;
   HbReport report_;
   HbEnergy scene_work_, cap_;
   float from_[3], velocity_[3], handle_step_[3];
+  float from_turn_[4], turning_[3], handle_turn_[3];
   float horizon_, lead_, share_, moved_;
   int32_t age_, silence_;
   bool has_started_, has_credit_, has_shown_, is_placed_;
 };
+
+typedef HbLoopOf<false> HbLoop;
+typedef HbLoopOf<true> HbPoseLoop;
 
 #endif

@@ -55,9 +55,60 @@ float get_float(const uint8_t* at) {
   return value;
 }
 
+void get_vector(const uint8_t* at, float vector[3]) {
+  for (int i = 0; i < 3; i++) vector[i] = get_float(at + 4 * i);
+}
+
+void put_vector(uint8_t* at, const float vector[3]) {
+  for (int i = 0; i < 3; i++) put_float(at + 4 * i, vector[i]);
+}
+
+// Reads stiffness, damping and level; false if one pushes the hand or overflows.
+bool get_gains(const uint8_t* at, HbGains& gains) {
+  if (!are_finite(at, 3)) return false;
+  for (int i = 0; i < 3; i++) {
+    if (get_float(at + 4 * i) < 0.0f || get_float(at + 4 * i) > LARGEST) return false;
+  }
+  gains.stiffness = get_float(at);
+  gains.damping = get_float(at + 4);
+  gains.level = get_float(at + 8);
+  return true;
+}
+
 void get_plane(const uint8_t* at, HbPlane& plane) {
-  for (int i = 0; i < 3; i++) plane.normal[i] = get_float(at + 4 * i);
+  get_vector(at, plane.normal);
   plane.gap = get_float(at + 12);
+}
+
+// Reads a vector of 16-bit numbers in a unit.
+void get_short(const uint8_t* at, float unit, float vector[3]) {
+  for (int i = 0; i < 3; i++) vector[i] = unit * (float)(int16_t)get16(at + 2 * i);
+}
+
+// Reads a shown tool; false if a number is not finite.
+bool get_tool(const uint8_t* frame, HbShown& shown) {
+  if (!are_finite(frame + 8, 6) || !are_finite(frame + 40, 4)) return false;
+  get_vector(frame + 8, shown.position);
+  get_vector(frame + 20, shown.velocity);
+  shown.work = get_energy(frame + 32);
+  get_plane(frame + 40, shown.plane[0]);
+  return true;
+}
+
+// Reads a shown tool with its rotation; false if a number is not finite.
+bool get_pose(const uint8_t* frame, HbShown& shown) {
+  if (!are_finite(frame + 8, 6) || !are_finite(frame + 58, 1)) return false;
+  const float none[4] = {1.0f, 0.0f, 0.0f, 0.0f};
+  float turn[3];
+  get_vector(frame + 8, shown.position);
+  get_vector(frame + 20, turn);
+  hb_turned(turn, none, shown.rotation);
+  shown.work = get_energy(frame + 32);
+  get_short(frame + 40, HB_SPEED_STEP, shown.velocity);
+  get_short(frame + 46, HB_TURN_STEP, shown.turning);
+  get_short(frame + 52, 1.0f / 32767.0f, shown.plane[0].normal);
+  shown.plane[0].gap = get_float(frame + 58);
+  return true;
 }
 
 void begin(uint8_t* frame, uint8_t kind, uint8_t option, uint16_t sequence) {
@@ -126,10 +177,8 @@ bool HbDevice::receive(const uint8_t frame[HB_FRAME_BYTES], uint32_t now_us) {
     if (!are_finite(frame + 8, 7)) return false;
     uint16_t watchdog_ms = get16(frame + 6);
     if (watchdog_ms > HB_LONGEST_WATCHDOG_MS) watchdog_ms = HB_LONGEST_WATCHDOG_MS;
-    for (int i = 0; i < 3; i++) {
-      command_.commanded.force[i] = get_float(frame + 8 + 4 * i);
-      command_.commanded.torque[i] = get_float(frame + 20 + 4 * i);
-    }
+    get_vector(frame + 8, command_.commanded.force);
+    get_vector(frame + 20, command_.commanded.torque);
     command_.commanded.grip = get_float(frame + 32);
     echo_ = get16(frame + 4);
     command_.is_enabled = (frame[3] & HB_OPTION_ENABLE) != 0;
@@ -214,15 +263,10 @@ bool HbDevice::take_order(const uint8_t frame[HB_FRAME_BYTES]) {
     planes_sequence_ = sequence;
     return true;
   }
-  if (frame[2] == HB_KIND_SHOW) {
-    if (!are_finite(frame + 8, 6) || !are_finite(frame + 40, 4)) return false;
+  const bool is_posed = (sheet_.axes & HB_POSE) != 0;
+  if (frame[2] == (is_posed ? HB_KIND_POSE : HB_KIND_SHOW)) {
     if (is_loop_ && (int16_t)(sequence - echo_) <= 0) return false;  // overtaken
-    for (int i = 0; i < 3; i++) {
-      shown.position[i] = get_float(frame + 8 + 4 * i);
-      shown.velocity[i] = get_float(frame + 20 + 4 * i);
-    }
-    shown.work = get_energy(frame + 32);
-    get_plane(frame + 40, shown.plane[0]);
+    if (!(is_posed ? get_pose(frame, shown) : get_tool(frame, shown))) return false;
     shown.planes = frame[3] / HB_OPTION_PLANE;
     const uint8_t known = planes_sequence_ == sequence ? HB_PLANES : 1;
     if (shown.planes > known) shown.planes = known;
@@ -233,15 +277,12 @@ bool HbDevice::take_order(const uint8_t frame[HB_FRAME_BYTES]) {
     echo_ = sequence;
     order_.kind = HbOrder::SHOW;
   } else if (frame[2] == HB_KIND_SETTING) {
-    if (!are_finite(frame + 8, 5)) return false;
-    for (int i = 0; i < 5; i++) {
-      const float value = get_float(frame + 8 + 4 * i);
-      if (value < 0.0f || value > LARGEST) return false;  // it pushes the hand, or overflows
-    }
+    HbGains gains, turn_gains, times;
+    if (!get_gains(frame + 8, gains) || !get_gains(frame + 36, turn_gains)) return false;
+    if (!get_gains(frame + 16, times)) return false;  // F, energy under way and fade
     HbSetting& setting = order_.setting;
-    setting.gains.stiffness = get_float(frame + 8);
-    setting.gains.damping = get_float(frame + 12);
-    setting.gains.level = get_float(frame + 16);
+    setting.gains = gains;
+    setting.turn_gains = turn_gains;
     setting.passing = get_float(frame + 20);
     setting.fade = get_float(frame + 24);
     setting.credit = get_energy(frame + 28);
@@ -261,14 +302,14 @@ void HbDevice::begin_state(uint8_t kind, const HbMotion& motion, uint32_t now_us
                            uint8_t frame[HB_FRAME_BYTES]) {
   command_.is_unfit = (motion.status & (HB_FAULT | HB_NOT_READY)) != 0;
   wrench(now_us);  // updates command_.has_expired
-  uint8_t status = motion.status & (HB_SATURATED | HB_FAULT | HB_NOT_READY);
+  uint8_t status = motion.status & (HB_SATURATED | HB_FAULT_DRIVER | HB_NOT_READY);
   if (!is_loop_ && command_.is_enabled) status |= HB_ENABLED;
   if (!is_loop_ && command_.has_expired) status |= HB_WATCHDOG;
   if (is_damaged_) status |= HB_DAMAGED;
   begin(frame, kind, status, ++sequence_);
   put16(frame + 6, motion.buttons);
   put32(frame + 8, now_us);
-  for (int i = 0; i < 3; i++) put_float(frame + 12 + 4 * i, motion.position[i]);
+  put_vector(frame + 12, motion.position);
   put16(frame + 60, echo_);
 }
 
@@ -276,16 +317,22 @@ void HbDevice::loop_state(const HbMotion& motion, const HbReport& report, uint32
                           uint8_t frame[HB_FRAME_BYTES]) {
   begin_state(HB_KIND_LOOP, motion, now_us, frame);
   if (report.share > 0.0f) frame[3] |= HB_ENABLED;
-  if (report.is_faulty) frame[3] |= HB_FAULT;
-  const float* position = turns() ? motion.rotation : motion.position;
-  const float* velocity = turns() ? motion.angular_velocity : motion.velocity;
-  for (int i = 0; i < 3; i++) {
-    put_float(frame + 12 + 4 * i, position[i]);
-    put_float(frame + 24 + 4 * i, velocity[i]);
-    put_float(frame + 36 + 4 * i, report.force[i]);
-  }
+  if (report.is_faulty && (frame[3] & HB_FAULT) == 0) frame[3] |= HB_FAULT_ENCODER;
+  put_vector(frame + 12, turns() ? motion.rotation : motion.position);
+  put_vector(frame + 24, turns() ? motion.angular_velocity : motion.velocity);
+  put_vector(frame + 36, report.force);
   put_energy(frame + 48, report.passed);
   put_float(frame + 56, 1e-12f * (float)report.tank);
+  seal(frame);
+}
+
+void HbDevice::loop_turn(const HbMotion& motion, const HbReport& report,
+                         uint8_t frame[HB_FRAME_BYTES]) {
+  begin(frame, HB_KIND_LOOP_TURN, 0, sequence_);
+  put_float(frame + 8, report.rotation[0]);
+  put_vector(frame + 12, report.rotation + 1);
+  put_vector(frame + 24, motion.angular_velocity);
+  put_vector(frame + 36, report.torque);
   seal(frame);
 }
 
@@ -299,17 +346,16 @@ void HbDevice::loop_report(const HbReport& report, const HbPace& pace,
   put32(frame + 32, pace.missed);
   put_float(frame + 36, report.share);
   put_float(frame + 40, pace.temperature);
-  for (int i = 0; i < 3; i++) put_float(frame + 44 + 4 * i, report.tool[i]);
+  put_vector(frame + 44, report.tool);
+  put_float(frame + 56, pace.temperature_limit);
   seal(frame);
 }
 
 void HbDevice::state(const HbMotion& motion, uint32_t now_us, uint8_t frame[HB_FRAME_BYTES]) {
   begin_state(HB_KIND_STATE, motion, now_us, frame);
-  for (int i = 0; i < 3; i++) {
-    put_float(frame + 24 + 4 * i, motion.rotation[i]);
-    put_float(frame + 36 + 4 * i, motion.velocity[i]);
-    put_float(frame + 48 + 4 * i, motion.angular_velocity[i]);
-  }
+  put_vector(frame + 24, motion.rotation);
+  put_vector(frame + 36, motion.velocity);
+  put_vector(frame + 48, motion.angular_velocity);
   if (sheet_.axes & HB_GRIP) {
     put_float(frame + 48, motion.grip_position);
     put_float(frame + 52, motion.grip_speed);

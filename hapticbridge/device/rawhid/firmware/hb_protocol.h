@@ -23,8 +23,18 @@
 
 static const size_t HB_NAME_BYTES = 54;
 
-// Axes, one bit each: along x, y, z and about them; and the grip between the fingers.
-enum HbAxis { HB_X = 1, HB_Y = 2, HB_Z = 4, HB_RX = 8, HB_RY = 16, HB_RZ = 32, HB_GRIP = 64 };
+// Axes, one bit each: along x, y, z and about them; and the grip between the fingers. HB_POSE is set
+// by an HbPoseBoard, whose loop renders rotation beside lines.
+enum HbAxis {
+  HB_X = 1,
+  HB_Y = 2,
+  HB_Z = 4,
+  HB_RX = 8,
+  HB_RY = 16,
+  HB_RZ = 32,
+  HB_GRIP = 64,
+  HB_POSE = 128
+};
 
 // Status bits of a state frame. The builder sets SATURATED, FAULT and NOT_READY in HbMotion; the
 // others are the protocol's.
@@ -34,7 +44,11 @@ enum HbStatus {
   HB_SATURATED = 4,   // the motors could not apply the whole wrench
   HB_FAULT = 8,       // encoder, driver or temperature: the device gives no force
   HB_NOT_READY = 16,  // the pose is not valid yet
-  HB_DAMAGED = 32     // a frame with a wrong CRC has come since the newest valid one
+  HB_DAMAGED = 32,    // a frame with a wrong CRC has come since the newest valid one
+  // in the place of HB_FAULT, where its cause is known
+  HB_FAULT_TEMPERATURE = HB_FAULT | HB_CAUSE_TEMPERATURE,  // a motor or its driver is too hot
+  HB_FAULT_ENCODER = HB_FAULT | HB_CAUSE_ENCODER,          // an encoder is not read
+  HB_FAULT_DRIVER = HB_FAULT | HB_CAUSE_DRIVER             // a motor's driver has switched off
 };
 
 // Data sheet of a grip axis; NAN for unknown numbers. The limits must be known.
@@ -147,12 +161,15 @@ class HbDevice {
   // True from the first order for a loop until the next force frame.
   bool is_loop() const { return is_loop_; }
 
-  // True if it has no axis but rotations: numbers of a loop are then angles in rad and torques in N m.
-  bool turns() const { return (sheet_.axes & (HB_X | HB_Y | HB_Z)) == 0; }
+  // True if it only turns, about one axis: numbers of a loop are then angles in rad and torques in N m.
+  bool turns() const { return (sheet_.axes & (HB_X | HB_Y | HB_Z | HB_POSE)) == 0; }
 
   // As state(), of a loop: its force and account in place of the rotation.
   void loop_state(const HbMotion& motion, const HbReport& report, uint32_t now_us,
                   uint8_t frame[HB_FRAME_BYTES]);
+
+  // Fills in the frame that follows a loop_state() of an HbPoseLoop: the rotation.
+  void loop_turn(const HbMotion& motion, const HbReport& report, uint8_t frame[HB_FRAME_BYTES]);
 
   // Fills in the frame with the counters of a loop.
   void loop_report(const HbReport& report, const HbPace& pace, uint8_t frame[HB_FRAME_BYTES]);

@@ -8,6 +8,10 @@
 //   device.receive(frame);                       // or receive_byte(byte)
 //   if (device.answer(frame)) send(frame);
 //   if (device.state(buttons, status, frame)) send(frame);
+//   if (device.more(frame)) send(frame);
+//
+// With rotation about up to three axes, as of a six-axis arm, define HB_SKETCH_POSE before this file:
+// the sketch then defines read_pose() and write_wrench() in their place.
 //
 // An AVR has no floating-point unit and is too slow for a loop of its own: it follows force frames
 // alone, loop() runs its periods, and its watchdog restarts a processor that hangs. On a Teensy an
@@ -19,6 +23,19 @@
 
 #include "hb_board.h"
 
+#ifdef HB_SKETCH_POSE
+
+// Reads the handle's position in m and its rotation, a quaternion (w, x, y, z). What the device lacks
+// stays as it is at the call: 0 m, and no turn. Called from the interrupt.
+void read_pose(float position[3], float rotation[4]);
+
+// Applies a force in N and a torque in N m at the handle, zero where there is to be none: by the
+// transposed Jacobian, the motors' torques. Called from the interrupt: it must not wait, print or
+// allocate.
+void write_wrench(const float force[3], const float torque[3]);
+
+#else
+
 // Reads the handle's position in m; axes that the device lacks stay 0. Of a device that only turns, a
 // knob, it is the angle in rad about its axis, and the force below a torque in N m. Called from the
 // interrupt.
@@ -27,6 +44,8 @@ void read_position(float position[3]);
 // Applies a force in N at the handle, zero where there is to be none. Called from the interrupt: it
 // must not wait, print or allocate.
 void write_force(const float force[3]);
+
+#endif
 
 // Returns a sheet of which all is unknown, for a device without rotation and grip.
 inline HbSheet hb_unknown_sheet() {
@@ -72,6 +91,10 @@ struct HbMotor {
 
 #include <avr/wdt.h>
 
+#ifdef HB_SKETCH_POSE
+#error "HB_SKETCH_POSE is for boards with a floating-point unit"
+#endif
+
 static const bool HB_HAS_LOOP = false;
 
 class HbSketchBoard {
@@ -91,8 +114,10 @@ class HbSketchBoard {
 
   void tick() {}
 
+  bool more(uint8_t[HB_FRAME_BYTES]) { return false; }
+
  protected:
-  void latch(float position[3]) { read_position(position); }
+  void latch(float position[3], float[4]) { read_position(position); }
 
   HbDevice board_;
 
@@ -102,6 +127,12 @@ class HbSketchBoard {
 };
 
 #else
+
+#ifdef HB_SKETCH_POSE
+typedef HbPoseBoard HbOwnBoard;
+#else
+typedef HbBoard HbOwnBoard;
+#endif
 
 #ifdef TEENSYDUINO
 inline void hb_start_timer(void (*tick)(), uint32_t period_us) {
@@ -127,21 +158,36 @@ class HbSketchBoard {
   // Runs what is due in loop().
   void poll() {}
 
+  // Sets the temperature of the motors and its limit in degrees Celsius, see HbBoard.
+  void set_temperature(float temperature, float limit) {
+    board_.set_temperature(temperature, limit);
+  }
+
   // Runs one period, in the timer's interrupt. It renders without loop(): if that hangs, no frame
   // is received, and the patience or the watchdog of the last one ends the force here. A processor
   // that has stopped keeps its PWM: drive an enable input of the driver by a hardware watchdog.
   void tick() {
     float position[3] = {0.0f, 0.0f, 0.0f}, force[3];
+#ifdef HB_SKETCH_POSE
+    float rotation[4] = {1.0f, 0.0f, 0.0f, 0.0f}, torque[3];
+    read_pose(position, rotation);
+    board_.tick(position, rotation, micros(), force, torque);
+    write_wrench(force, torque);
+#else
     read_position(position);
     board_.tick(position, micros(), force);
     write_force(force);
+#endif
   }
 
- protected:
-  // Reads the newest position in m.
-  void latch(float position[3]) { board_.latched(position); }
+  // Fills in the second frame of the last state; returns false if there is none.
+  bool more(uint8_t frame[HB_FRAME_BYTES]) { return board_.more(frame); }
 
-  HbBoard board_;
+ protected:
+  // Reads the newest position in m, and the quaternion with rotation.
+  void latch(float position[3], float rotation[4]) { board_.latched(position, rotation); }
+
+  HbOwnBoard board_;
 
  private:
   const uint32_t period_us_;
@@ -159,6 +205,8 @@ class HbSketch : public HbSketchBoard {
         due_us_(0),
         last_us_(0) {
     memset(last_, 0, sizeof last_);
+    memset(last_turn_, 0, sizeof last_turn_);
+    last_turn_[0] = 1.0f;
   }
 
   // Takes one report from the host.
@@ -180,11 +228,20 @@ class HbSketch : public HbSketchBoard {
     memset(&motion, 0, sizeof motion);
     float* position = board_.turns() ? motion.rotation : motion.position;
     float* velocity = board_.turns() ? motion.angular_velocity : motion.velocity;
-    latch(position);
+    const float since = 1e-6f * (float)(now_us - last_us_);
+    float rotation[4] = {1.0f, 0.0f, 0.0f, 0.0f};
+    latch(position, rotation);
     for (int i = 0; i < 3; i++) {
-      velocity[i] = (position[i] - last_[i]) / (1e-6f * (float)(now_us - last_us_));
+      velocity[i] = (position[i] - last_[i]) / since;
       last_[i] = position[i];
     }
+#ifdef HB_SKETCH_POSE
+    const float none[4] = {1.0f, 0.0f, 0.0f, 0.0f};
+    hb_turn(none, rotation, motion.rotation);
+    hb_turn(last_turn_, rotation, motion.angular_velocity);
+    for (int i = 0; i < 3; i++) motion.angular_velocity[i] /= since;
+    memcpy(last_turn_, rotation, sizeof rotation);
+#endif
     last_us_ = now_us;
     motion.buttons = buttons;
     motion.status = status;
@@ -195,7 +252,7 @@ class HbSketch : public HbSketchBoard {
  private:
   const uint32_t state_period_us_;
   uint32_t due_us_, last_us_;
-  float last_[3];
+  float last_[3], last_turn_[4];
 };
 
 #endif
