@@ -194,7 +194,7 @@ def test_the_command_asks_what_if_and_draws_every_hand(
     assert "damping at 'left': 0.5 N s/m -> 0.2 N s/m" in printed
     assert "peak force on hand" in printed
     assert "at 'right'" in printed  # a narrow table breaks the line before
-    assert "K, B asked for at &#39;right&#39;" in page.read_text(encoding="utf-8")
+    assert "K, B as set at &#39;right&#39;" in page.read_text(encoding="utf-8")
     assert plot.stat().st_size > 20_000
 
 

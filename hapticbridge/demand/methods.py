@@ -369,13 +369,13 @@ class RunCoupling:
 
         notes = [other(law, "B_law")] if law and felt else []
         if asked and (felt or law) and not np.allclose(asked, first, rtol=1e-9, atol=0.0):
-            notes.append(f"asked for {other(asked)}")
+            notes.append(f"set {other(asked)}")
         notes += [f"near contact or held, as here: {other(near)}"] if near else []
-        notes += ["unknown at the hand"] if law and not felt else []
+        notes += ["what a hand feels is unknown"] if law and not felt else []
         notes += [self.remark] if self.remark else []
         beside = f" ({', '.join(notes)})" if notes else ""
         name = "B_law" if law and not felt else b
-        words = "" if felt or law else " asked for"
+        words = "" if felt or law else " as set"
         return (
             f"{k} = {format_number(first[0])} {k_unit}, "
             f"{name} = {first[1]:.4g} {b_unit}{words}{beside}"

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 Row = tuple[str, tuple[str, ...]]
 
-COUPLINGS = {"effective": "K, B", "law": "K, B_law", "requested": "K, B asked for"}
+COUPLINGS = {"effective": "K, B", "law": "K, B_law", "requested": "K, B as set"}
 """Titles of the couplings of a run."""
 
 
