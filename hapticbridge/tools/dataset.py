@@ -89,6 +89,11 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
     name = recording.path.name
     tell = None if progress is None else lambda done, total: progress(done, total, name)
     found = states(recording.path, shot, tell)
+    is_posted = meta_float(recording.meta, "credit") > 0.0  # the scene is the shown tool alone
+    if is_posted:  # the loop ran before its program showed a tool
+        begin = int(np.searchsorted(found["rows"]["tick"], _placed_at(recording), side="right"))
+        for key in ("rows", "qpos", "qvel", "ctrl", "sensors", "pictures"):
+            found[key] = found[key][begin:]
     rows, count = found["rows"], len(found["rows"]) - 1
     if count < 1:
         raise RecordingError(f"'{recording.path}' is shorter than two frames at {shot.fps} Hz")
@@ -113,7 +118,7 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
         ACTION: (*POSE, *WRENCH),
     }
     left_out = [column for column in (CTRL, SENSORS) if not names[column]]
-    if meta_float(recording.meta, "credit") > 0.0:  # the scene is the shown tool alone
+    if is_posted:
         left_out.append(QPOS)
     for column in left_out:
         del values[column], names[column]
@@ -485,13 +490,31 @@ def write_dataset(
     return WrittenDataset(folder, tuple(counts), tuple(map(_resets, recordings)))
 
 
+AGAIN = 50
+"""Ticks within which a program that places its tool at the same pose repeats what it has said."""
+
+
+def _placings(recording: RecordingFile) -> list[Mapping[str, Any]]:
+    """Returns the resets of a run, and of another program's tool where it was placed anew."""
+    found: list[Mapping[str, Any]] = []
+    for event in recording.events:
+        if event.get("event") == "reset":
+            last = found[-1] if found else {}
+            is_near = event.get("tick", 0) - last.get("tick", -AGAIN) < AGAIN
+            if not (is_near and "pose" in event and event["pose"] == last.get("pose")):
+                found.append(event)
+    return found
+
+
+def _placed_at(recording: RecordingFile) -> int:
+    """Returns the tick at which another program first showed its tool; 0 if it never did."""
+    return int(next(iter(_placings(recording)), {}).get("tick", 0))
+
+
 def _resets(recording: RecordingFile) -> tuple[float, ...]:
-    """Returns the times in s of the resets of a run; its tool is placed in the first two ticks."""
-    return tuple(
-        time_of(event)
-        for event in recording.events
-        if event.get("event") == "reset" and event.get("tick", 0) > 1
-    )
+    """Returns the times in s at which an episode jumps; the first placing only begins it."""
+    is_posted = meta_float(recording.meta, "credit") > 0.0
+    return tuple(map(time_of, _placings(recording)[is_posted:]))
 
 
 def _sound(recording: RecordingFile) -> RecordingFile:
