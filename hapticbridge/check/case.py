@@ -268,6 +268,7 @@ def _compile(source: SceneSource, grip: str) -> tuple[Scene, dict[int, str]]:
         body = spec.body(key) if isinstance(key, str) else spec.bodies[key]
         body.explicitinertial, body.mass = True, STAND_IN_MASS
         body.inertia, body.fullinertia = np.full(3, STAND_IN_INERTIA), np.full(6, np.nan)
+        body.ipos = np.nan_to_num(body.ipos)  # MuJoCo would take the body's own position for it
         source = replace(source, spec=spec)
 
 
