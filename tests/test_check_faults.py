@@ -27,7 +27,7 @@ from check_scenes import (
 from outside_scenes import hand_rows, mjcf
 
 from hapticbridge.check import lean
-from hapticbridge.check.case import IntendedUse, open_case
+from hapticbridge.check.case import IntendedUse, open_case, samples_of
 from hapticbridge.check.contact_faults import shape_faults
 from hapticbridge.check.findings import find_faults
 from hapticbridge.check.inventory import take_inventory
@@ -655,6 +655,20 @@ def test_an_actuator_that_only_brakes_is_no_motor(
     assert [words in fault.sentence for words, fault in zip(told, faults, strict=True)] == (
         [True] * len(told)
     )
+
+
+@pytest.mark.parametrize("seconds", [1.5, 0.2])
+def test_a_long_motion_is_seen_as_far_as_the_work_goes_and_this_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: float
+) -> None:
+    for module in ("case", "observe"):
+        monkeypatch.setattr(f"hapticbridge.check.{module}.MAX_WORK", 6000)  # of 6 per tick
+    (tmp_path / "far.csv").write_text(f"t,x,y,z\n0,0,0,0\n{seconds},0.001,0,0\n")
+    case = case_of(scene_path("point_mass"), tmp_path / "far.csv")
+    is_cut = case.motion_name.endswith("far.csv; the first 1 s of it alone")
+    assert (is_cut, case.motion_name.endswith("far.csv")) == (seconds > 1, seconds < 1)
+    endless = Motion(np.array([0.0, 1e12]), np.zeros((2, 3)), np.array([[1.0, 0, 0, 0]] * 2))
+    assert samples_of(endless, 1e-3).size == 6001, "more than any memory holds"
 
 
 def test_a_solver_at_its_limit_in_one_tick_of_thousands_is_no_fault() -> None:
