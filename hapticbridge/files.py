@@ -150,14 +150,17 @@ def limit_words(number: int | None) -> str:
 def folder_words(error: OSError) -> str:
     """Returns that a folder of the process is missing if this is the error; else empty.
 
-    Only the current folder and that of temporary files are looked for without a name.
+    That of temporary files is looked for without a name; a relative name needs the current folder.
     """
-    if not isinstance(error, FileNotFoundError) or error.filename is not None:
+    named = error.filename is not None
+    if not isinstance(error, FileNotFoundError) or (named and Path(error.filename).is_absolute()):
         return ""
     try:
         Path.cwd()
     except FileNotFoundError:
         return "the current folder was removed; change to another one"
+    if named:
+        return ""
     return f"{error.strerror}; free space there, lift 'ulimit -f', or set TMPDIR to another folder"
 
 

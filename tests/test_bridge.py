@@ -257,6 +257,7 @@ def test_a_bridge_is_opened_once_and_says_so_where_it_is_not_open() -> None:
         ("stiffness", "gain of the coupling: write coupling={'stiffness': …}"),
         ("reach", "belongs to the option limits: write it in hb.Limits"),
         ("scale", "belongs to the option workspace"),
+        ("grip", "belongs to the scene: write hb.load_scene(…, grip=…)"),
         ("speed", "no option 'speed'; it has 'clutch', "),
     ],
 )

@@ -27,7 +27,7 @@ from check_scenes import (
 from outside_scenes import hand_rows, mjcf
 
 from hapticbridge.check import lean
-from hapticbridge.check.case import IntendedUse, open_case
+from hapticbridge.check.case import IntendedUse, open_case, samples_of
 from hapticbridge.check.contact_faults import shape_faults
 from hapticbridge.check.findings import find_faults
 from hapticbridge.check.inventory import take_inventory
@@ -45,6 +45,7 @@ from hapticbridge.scene import compile_scene, read_scene, scene_names, scene_pat
 from hapticbridge.scene.fault import Fault, length, weight
 from hapticbridge.scene.first_faults import worst_faults
 from hapticbridge.scene.physics import depth_under
+from hapticbridge.scene.source_map import Place
 
 CREATED = {"energy created", "energy in the slack"}
 
@@ -326,6 +327,37 @@ def test_a_keyframe_of_an_attached_model_is_not_renamed_but_replaced(tmp_path: P
     assert '<key name="home" qpos="…"/> in a <keyframe> of whole.xml' in fault.change
 
 
+@pytest.mark.parametrize(
+    ("option", "kinds_told"),
+    [("", {"c-arm": 7}), ('<default><geom density="1000"/></default>', {})],
+)
+def test_a_geom_of_an_attached_model_is_named_in_its_file_and_not_of_water_by_its_density(
+    tmp_path: Path, option: str, kinds_told: dict[str, int]
+) -> None:
+    (tmp_path / "part.xml").write_text(f"""<mujoco model="part">
+  {option}
+  <worldbody>
+    <body name="arm">
+      <joint name="j" axis="0 1 0"/>
+      <geom size=".01" density="1000"/>
+      <geom size=".02"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>""")
+    whole = """<mujoco><asset><model name="part" file="part.xml"/></asset>
+      <worldbody><attach model="part" body="arm" prefix="c-"/></worldbody></mujoco>"""
+    (tmp_path / "whole.xml").write_text(whole)
+    case = open_case(read_scene(tmp_path / "whole.xml"), "c-grip")
+    told = [fault for fault in find_faults(case) if fault.kind == "density of water"]
+    assert [(fault.place.file, fault.place.line) for fault in told] == [
+        ("part.xml", line) for line in kinds_told.values()
+    ]
+    assert case.places.body(1) == Place("part.xml", 4, "body 'c-arm'")
+    for fault in told:  # the other geom weighs, too
+        assert fault.change == 'mass="…", what it really weighs'
+
+
 def test_start_beyond_all_numbers_is_named_at_its_keyframe(tmp_path: Path) -> None:
     plant = Plant("start not finite", "<!-- keys -->", f"<keyframe>{KEY}</keyframe>")
     assert "start not finite" not in kinds(faults_of(bench(tmp_path / "near", plant)))
@@ -540,6 +572,16 @@ def test_mass_is_taken_from_what_is_only_seen_and_not_from_what_collides(tmp_pat
     assert solid.change.startswith('mass="…"')
 
 
+@pytest.mark.parametrize(("mass", "expected"), [("0", "missing inertia"), ("0.1", "far grip")])
+def test_a_tool_whose_inertia_is_refused_has_no_centre_that_the_grip_is_far_from(
+    tmp_path: Path, mass: str, expected: str
+) -> None:
+    body = f"""<body name="tool" pos="0 0.7 0"><joint type="slide"/>
+        <geom size="0.01" mass="{mass}"/><site name="grip" pos="0 0 0.2"/></body>"""
+    found = kinds(faults_in(tmp_path, mjcf(GOOD_OPTION, body=body), STILL))
+    assert found & {"missing inertia", "far grip"} == {expected}
+
+
 @pytest.mark.parametrize(("floor", "is_told"), [("", True), (FLOOR, False)])
 def test_a_body_that_falls_for_ever_is_told(tmp_path: Path, floor: str, is_told: bool) -> None:
     ball = '<body name="ball" pos="0.2 0 0.1"><freejoint/><geom size="0.02" mass="0.1"/></body>'
@@ -592,6 +634,41 @@ def test_what_a_motor_holds_against_gravity_is_not_told_but_what_it_pushes_beyon
             found = [f for f in faults_in(tmp_path, text, STILL) if f.kind == "motor"]
             assert [fault.place.element for fault in found] == ["actuator 'hoist'"] * is_told
             assert all(f" with {abs(force):g} N from" in fault.sentence for fault in found)
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        ('damper kv="4" ctrlrange="0 2"', []),  # takes 4 N s/m at control 1
+        ('velocity kv="4"', ["pushes joint 'rail' with 12 N"]),  # brakes to 1 m/s, and drives there
+        ('motor gear="-4"', ["pushes joint 'rail' with 4 N"]),
+    ],
+)
+def test_an_actuator_that_only_brakes_is_no_motor(
+    tmp_path: Path, kind: str, told: list[str]
+) -> None:
+    joint = '<joint name="rail" axis="1 0 0" type="slide"/>'
+    slide = f'<body name="tool">{joint}<geom size="0.01" mass="1"/><site name="grip"/></body>'
+    moving = f"""<actuator><{kind} joint="rail"/></actuator>
+        <keyframe><key name="home" qvel="4" ctrl="1"/></keyframe>"""
+    faults = [f for f in faults_in(tmp_path, mjcf(moving, body=slide), STILL) if f.kind == "motor"]
+    assert [words in fault.sentence for words, fault in zip(told, faults, strict=True)] == (
+        [True] * len(told)
+    )
+
+
+@pytest.mark.parametrize("seconds", [1.5, 0.2])
+def test_a_long_motion_is_seen_as_far_as_the_work_goes_and_this_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: float
+) -> None:
+    for module in ("case", "observe"):
+        monkeypatch.setattr(f"hapticbridge.check.{module}.MAX_WORK", 6000)  # of 6 per tick
+    (tmp_path / "far.csv").write_text(f"t,x,y,z\n0,0,0,0\n{seconds},0.001,0,0\n")
+    case = case_of(scene_path("point_mass"), tmp_path / "far.csv")
+    is_cut = case.motion_name.endswith("far.csv; the first 1 s of it alone")
+    assert (is_cut, case.motion_name.endswith("far.csv")) == (seconds > 1, seconds < 1)
+    endless = Motion(np.array([0.0, 1e12]), np.zeros((2, 3)), np.array([[1.0, 0, 0, 0]] * 2))
+    assert samples_of(endless, 1e-3).size == 6001, "more than any memory holds"
 
 
 def test_a_solver_at_its_limit_in_one_tick_of_thousands_is_no_fault() -> None:

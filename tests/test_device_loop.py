@@ -181,6 +181,18 @@ def test_each_mistake_of_a_program_gets_a_sentence() -> None:
         device.advance(0.0)
 
 
+@pytest.mark.parametrize(("step", "count"), [(1 / 30, 30), (1 / 240, 60), (0.0004, 100)])
+def test_steps_that_are_no_whole_ticks_add_up_to_their_time(
+    tmp_path: Path, step: float, count: int
+) -> None:
+    path = tmp_path / "run.mcap"
+    with DeviceLoop("simulated", recording=path, is_simulated=True) as device:
+        device.show(START)
+        for _ in range(count):
+            device.advance(step)
+    assert len(read_recording(path).ticks) == pytest.approx(1000 * step * count, abs=1)
+
+
 @pytest.mark.parametrize(
     ("device", "options", "words"),
     [

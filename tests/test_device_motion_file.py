@@ -96,6 +96,21 @@ def test_messages_without_stamps_have_the_times_of_the_log(tmp_path: Path) -> No
     np.testing.assert_allclose(read_bag(file).table[:, 0], [0, 0.01, 0.02], atol=1e-12)
 
 
+@pytest.mark.parametrize("unset", [[0], [0, 1], [3]])
+def test_some_messages_without_stamps_are_told_and_a_simulated_clock_from_0_is_not(
+    tmp_path: Path, unset: list[int]
+) -> None:
+    messages = ramp()
+    for k in unset:
+        messages[k] = messages[k][0], pose_message(0, 1e-3 * k)
+    (file,) = bag(tmp_path / "walk", {"/hand": messages}).glob("*.mcap")
+    words = f"is 0 in {len(unset)} of the 5 messages of /hand, first in message {unset[0]},"
+    with pytest.raises(DeviceError, match=words):
+        read_bag(file)
+    (file,) = bag(tmp_path / "simulated", {"/hand": ramp(start=0)}).glob("*.mcap")
+    np.testing.assert_allclose(read_bag(file).table[:, 0], 0.01 * np.arange(5), atol=1e-12)
+
+
 @pytest.mark.parametrize("jump", [3 * 10**7, -3600 * 10**9])
 def test_a_log_that_jumps_leaves_messages_with_stamps_in_the_order_of_the_file(
     tmp_path: Path, jump: int

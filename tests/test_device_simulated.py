@@ -488,6 +488,20 @@ def test_a_device_is_displaced_only_between_start_and_first_sample() -> None:
         device.displace(knock)
 
 
+def test_a_hand_that_is_firmer_for_a_spring_does_not_say_that_it_lifts(tmp_path: Path) -> None:
+    path = tmp_path / "lever.xml"
+    path.write_text(
+        """<mujoco><option gravity="0 0 0"/><worldbody><body><joint type="slide" stiffness="10"
+        springref="0.3"/><geom size=".01" mass=".1"/><site name="grip"/></body></worldbody>
+        </mujoco>"""
+    )
+    said: list[str] = []
+    device_for(load_scene(path), "simulated", said.append)
+    assert said == [
+        "the simulated hand grips with 600 N/m instead of 135, so that it holds this tool"
+    ]
+
+
 @pytest.mark.parametrize(("mass", "stiffness"), [(0.1, 135.0), (0.35, 686.7), (3.0, 135.0)])
 def test_hand_is_firm_enough_to_lift_the_tool(
     tmp_path: Path, mass: float, stiffness: float

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import SeekingReader, make_reader
+from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from recording_cases import EPOCH, META, random_rows, write
 from rosbags.highlevel import AnyReader
@@ -199,3 +200,43 @@ def test_a_schema_that_names_other_numbers_is_found(
     problems = read_recording(forged).problems
     assert any("/tool_pose has another schema" in problem for problem in problems)
     assert audit(forged).verdict != "passive"
+
+
+def written_anew(path: Path, output: Path, *, is_forged: bool, step: int = 1) -> None:
+    """Writes a recording with the library: topic after topic, and the metadata at the end."""
+    with path.open("rb") as source, output.open("wb") as target:
+        reader, writer = SeekingReader(source), Writer(target)
+        writer.start(profile="ros2")
+        ids: dict[str, int] = {}
+        messages = list(reader.iter_messages(log_time_order=False))
+        for schema, channel, message in sorted(messages, key=lambda m: m[1].topic)[::step]:
+            assert schema is not None
+            if channel.topic not in ids:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                ids[channel.topic] = writer.register_channel(channel.topic, "cdr", known)
+            data = bytearray(message.data)
+            data[-2] ^= is_forged and channel.topic == "/tf"
+            writer.add_message(ids[channel.topic], message.log_time, bytes(data), message.log_time)
+        for metadata in reader.iter_metadata():
+            writer.add_metadata(metadata.name, metadata.metadata)
+        for item in reader.iter_attachments():
+            writer.add_attachment(0, 0, item.name, item.media_type, item.data)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def test_order_of_topics_and_metadata_is_no_damage_but_what_they_say_and_ticks_backwards_are(
+    run: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "anew.mcap"
+    written_anew(run, path, is_forged=False)
+    recording = read_recording(path)
+    assert (recording.problems, recording.meta) == ((), read_recording(run).meta)
+    assert audit(path).verdict == "passive"
+    written_anew(run, path, is_forged=True)
+    assert read_recording(path).problems == (
+        "what '/tf' say does not follow from the ticks and events",
+    )
+    written_anew(run, path, is_forged=False, step=-1)
+    assert read_recording(path).problems == (
+        "its ticks are not in order: tick 1499 is followed by tick 1498",
+    )

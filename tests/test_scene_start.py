@@ -324,7 +324,7 @@ def test_a_load_that_sinks_in_the_hand_is_named_with_its_energy(tmp_path: Path) 
     # the weight of 5 N sinks with the hand, which the simulated springs of 135 N/m let down
     assert released == pytest.approx(-summary.energies["coupling_work"], rel=0.01)
     assert released > 0.04
-    words = f"gave the hand {1e3 * released:.3g} mJ, as weights that sink and springs do"
+    words = f"gave the hand {1e3 * released:.3g} mJ, as weights that sink, springs and bodies that"
     assert words in str(summary)
     assert words in hb.audit(tmp_path / "run.mcap").reason
 

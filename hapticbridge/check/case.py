@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.observe import Observation, observe
+from hapticbridge.check.observe import MAX_WORK, Observation, observe
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.demand.methods import RIGID, default_method
@@ -69,12 +69,14 @@ def motion_for(scene: Scene, path: str | Path | None = None) -> Motion | None:
 def samples_of(motion: Motion, period: float) -> NDArray[np.void]:
     """Samples the motion as the loop would, one ``SAMPLE_DTYPE`` per period T in s.
 
+    Of a long motion it takes as many as an observation sees at most (``MAX_WORK``).
+
     Raises:
         DeviceError: The period is not finite and > 0.
     """
     device = TrajectoryDevice(motion)
     sample = device.start(period)
-    samples = np.zeros(int(motion.duration / period) + 1, SAMPLE_DTYPE)
+    samples = np.zeros(int(min(motion.duration / period, MAX_WORK)) + 1, SAMPLE_DTYPE)
     for k in range(samples.size):
         device.read(sample)
         samples[k] = sample[0]
@@ -217,9 +219,9 @@ def open_case(
     try:
         with quiet():
             observation = observe(scene, samples, setting, progress)
-        if observation.force.size < samples.size:
-            samples = samples[: observation.force.size]
-            name += f"; of this heavy scene the first {samples.size * period:.2g} s alone"
+        samples = samples[: observation.force.size]
+        if samples.size <= chosen.duration / period:
+            name += f"; the first {samples.size * period:.3g} s of it alone"
     except (SceneError, mujoco.FatalError) as error:
         fault = " ".join(str(error).split())
     finally:
@@ -268,6 +270,7 @@ def _compile(source: SceneSource, grip: str) -> tuple[Scene, dict[int, str]]:
         body = spec.body(key) if isinstance(key, str) else spec.bodies[key]
         body.explicitinertial, body.mass = True, STAND_IN_MASS
         body.inertia, body.fullinertia = np.full(3, STAND_IN_INERTIA), np.full(6, np.nan)
+        body.ipos = np.nan_to_num(body.ipos)  # MuJoCo would take the body's own position for it
         source = replace(source, spec=spec)
 
 

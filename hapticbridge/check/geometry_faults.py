@@ -99,8 +99,8 @@ def grip_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         yield Fault("held grip", case.places.site(site), clause, LET_GO)
     tool_bodies, body = case.tool_bodies, int(model.site_bodyid[site])
     mass = model.body_mass[tool_bodies]
-    if not mass.sum() > 0:  # it has no centre, and another fault says so
-        return
+    if not mass.sum() > 0 or tool_bodies[list(case.refused)].any():
+        return  # it has no centre, and another fault says so
     centre = mass @ scene.data.xipos[tool_bodies] / mass.sum()
     grip = scene.data.site_xpos[site]
     distance = float(np.linalg.norm(grip - centre))

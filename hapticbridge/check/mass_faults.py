@@ -65,11 +65,13 @@ def _default_densities(case: SceneUnderCheck) -> Iterator[Fault]:
         mass = float(model.body_mass[body])
         if visual:
             yield _made_of_water(case, body, visual, "visual geom with mass", 'mass="0"')
-        if len(those) == 1 and solid:
-            mend = f'mass="{number(mass)}", or what it really weighs'
-            yield _made_of_water(case, body, solid, "density of water", mend)
-        elif solid:
-            mend = f'mass="…" in each, what it really weighs; now {weight(mass)} together'
+        if solid:
+            rest = np.setdiff1d(np.flatnonzero(model.geom_bodyid == body), those)
+            mend = f'mass="…"{" in each" * (len(those) > 1)}, what it really weighs'
+            if all(geoms[geom].mass == 0.0 for geom in rest):
+                mend = f"{mend}; now {weight(mass)} together"
+                if len(those) == 1:
+                    mend = f'mass="{number(mass)}", or what it really weighs'
             yield _made_of_water(case, body, solid, "density of water", mend)
 
 
@@ -97,7 +99,7 @@ def _sets_no_mass(case: SceneUnderCheck, geom: int, written: Any) -> bool:
         and written.density == WATER
         and low <= written.group <= high
         and not written.parent.explicitinertial
-        and "density" not in case.places.attributes_at(case.places.geom(geom))
+        and not case.places.may_set("geom", "density", case.places.geom(geom))
     )
 
 

@@ -234,6 +234,10 @@ def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
 
 POSE = "geometry_msgs/msg/PoseStamped"
 
+MAX_SILENCE = 86_400 * 10**9
+"""Longest time in ns after a stamp of 0 at which the next one may be of the same, simulated clock:
+a day. Unix time is beyond it."""
+
 _DAMAGED = ValueError, RuntimeError, EOFError, OverflowError, MemoryError, ZstdError
 """Errors besides its own with which the package mcap meets a damaged file."""
 
@@ -259,7 +263,7 @@ def read_bag(path: Path, topic: str = "") -> Motion:
 
     Raises:
         DeviceError: The file cannot be read, a checksum of it does not match, it has no such topic,
-            or a message is not valid.
+            a message is not valid, or some stamps are 0 and others of another clock.
     """
     # imported here, because no other device needs it
     from mcap.exceptions import McapError  # noqa: PLC0415
@@ -303,6 +307,12 @@ def read_bag(path: Path, topic: str = "") -> Motion:
     times = np.array(stamps if any(stamps) else logged, dtype=np.int64)
     if len(times) < 2:
         raise DeviceError(f"{path}: {topic} has {len(times)} of at least two messages")
+    unset = np.flatnonzero(times == 0)
+    if unset.size and (unset.size > 1 or unset[0] > 0 or times[1] > MAX_SILENCE):
+        raise DeviceError(
+            f"{path}: the stamp is 0 in {unset.size} of the {times.size} messages of {topic}, "
+            f"first in message {unset[0]}, as before a clock is set; write the bag without them"
+        )
     table = np.empty((len(times), 8))
     table[:, 0] = (times - times[0]) * 1e-9
     table[:, 1:] = np.array(numbers)[:, [0, 1, 2, 6, 3, 4, 5]]  # ROS has w last

@@ -360,7 +360,7 @@ def device_for(
         if hand != usual:
             notify(
                 f"the simulated hand grips with {hand.stiffness:.0f} N/m instead of "
-                f"{usual.stiffness:g}, so that it lifts this tool"
+                f"{usual.stiffness:g}, so that it holds this tool"
             )
     others = [each for each in scene.other_grips if each != str(Grip(grip_axis, "joint"))]
     grip = Grip.from_text(scene.grip).name

@@ -122,8 +122,8 @@ class HandEnergy:
         if self.scene <= RELEASE:
             return ""
         return (
-            f"gave the hand {format_energy(self.scene)}, as weights that sink and springs do; the "
-            "energy limit leaves it out"
+            f"gave the hand {format_energy(self.scene)}, as weights that sink, springs and bodies "
+            "that slow down do; the energy limit leaves it out"
         )
 
     @property

@@ -179,6 +179,7 @@ class DeviceLoop:
         command += ["--fast"] * is_simulated
         self._process = None if self._remote else LoopProcess(command, self._token.decode())
         self._lock = threading.Lock()
+        self._rest = 0.0  # s of simulated time beyond the last whole tick
         self._call = np.zeros(1, CALL_DTYPE)
         self._call["version"], self._call["program"] = VERSION, secrets.randbits(63)
         self._state: np.void = np.zeros(1, STATE_DTYPE)[0]
@@ -346,7 +347,7 @@ class DeviceLoop:
         """Lets simulated time go on, and waits until it has.
 
         Args:
-            seconds: Time in s; whole ticks of it count, at least one.
+            seconds: Time in s; whole ticks of it go by, and the rest counts in the next call.
 
         Raises:
             HapticBridgeError: The loop runs in real time, or the time is no number >= 0.
@@ -360,7 +361,12 @@ class DeviceLoop:
         if not 0.0 <= float(numbers_of("seconds", seconds)) <= LONGEST_ADVANCE:
             raise HapticBridgeError(f"seconds is {seconds!r}; it must be 0 to {LONGEST_ADVANCE:g}")
         with self._lock:
-            self._call["ticks"] = max(round(seconds / float(state["period"])), 1)
+            period = float(state["period"])
+            ticks = round((self._rest + seconds) / period)
+            self._rest += seconds - ticks * period
+            if ticks == 0:
+                return
+            self._call["ticks"] = ticks
             self._send(Call.ADVANCE)
             call = packed(self._call, self._token)
             wanted = int(self._call["sequence"][0])

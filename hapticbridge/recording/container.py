@@ -291,6 +291,24 @@ class Container:
         ]
         return Block("the index at the end of the file", b"".join(pieces))
 
+    def metadata(self, name: str) -> dict[str, str] | None:
+        """Returns the first metadata record of a name, wherever it stands; None without one.
+
+        A program that writes a file anew may write it behind the messages. Damage is reported by
+        ``records``.
+        """
+        found, self.problems = self.problems, []
+        try:
+            for opcode, body, stop in self._walk(len(MAGIC), self._end, self._chunks):
+                fields = Fields(self._data, body, stop)
+                if opcode == Opcode.METADATA and fields.text() == name:
+                    return fields.mapping()
+        except DamageError:
+            pass
+        finally:
+            self.problems = found
+        return None
+
     def records(self) -> Iterator[_Record]:
         """Yields blocks of messages and, as (opcode, fields), metadata and attachments, in order.
 

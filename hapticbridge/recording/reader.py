@@ -56,6 +56,7 @@ class Contents:
         events: JSON object of each event.
         attachments: Attachments in order.
         meta: The metadata; None before they are read.
+        meta_ahead: The metadata, read before all else to derive the messages for ROS 2.
         refusal: Reason why the records cannot be read; None if they can.
         keeps_events: True to parse events, and to compare the messages for ROS 2.
         has_messages: True if there are such messages.
@@ -66,6 +67,7 @@ class Contents:
     events: list[dict[str, Any]] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
     meta: dict[str, str] | None = None
+    meta_ahead: dict[str, str] | None = None
     refusal: str | None = None
     keeps_events: bool = True
     has_messages: bool = False
@@ -219,11 +221,11 @@ class Contents:
 
     def _expected(self) -> ros_messages.Messages | None:
         """Returns what derives the messages for ROS 2; None for a file without them."""
-        if not self.has_messages or not self.keeps_events or self.meta is None:
+        if not self.has_messages or not self.keeps_events or self.meta_ahead is None:
             return None
         if self._messages is None:
-            axes = ros_messages.axes_of(self.meta)
-            self._messages = ros_messages.Messages(layout.epoch_of(self.meta), axes)
+            axes = ros_messages.axes_of(self.meta_ahead)
+            self._messages = ros_messages.Messages(layout.epoch_of(self.meta_ahead), axes)
         return self._messages
 
     def message_fault(self) -> str:
@@ -493,11 +495,15 @@ def _read_through(
     ``runs`` receives the records of the hand unless there are more than ``max_kept``.
     """
     counts, last, flags = [0] * layout.MAX_HANDS, [-1] * layout.MAX_HANDS, 0
-    chosen = hand or 0
+    chosen, disorder = hand or 0, ""
 
     def take(run: NDArray[np.void], hand: int) -> None:
-        nonlocal flags
+        nonlocal flags, disorder
         counts[hand] += run.size
+        numbers = np.concatenate([[last[hand]], run["tick"]])
+        if not disorder and (falls := np.flatnonzero(numbers[1:] <= numbers[:-1])).size:
+            before, after = numbers[falls[0] : falls[0] + 2]
+            disorder = f"its ticks are not in order: tick {before} is followed by tick {after}"
         last[hand] = int(run["tick"][-1]) if run.size else last[hand]
         if hand != chosen:
             return
@@ -525,7 +531,7 @@ def _read_through(
         contents.problems.append("its hands have different numbers of records")
     is_whole = not container.is_cut and not contents.problems
     if is_whole and (fault := contents.message_fault()):
-        contents.problems.append(fault)
+        contents.problems.append(disorder or fault)
     if contents.meta is None and contents.problems:
         meta = LostMetadata(path, dict.fromkeys(contents.problems))
     facts = {
@@ -579,6 +585,8 @@ def _read_parts(
         container = Container(data)
         contents = Contents(container.problems, take, keeps_events=keeps_events)
         contents.add_block(container.summary())
+        if keeps_events:
+            contents.meta_ahead = container.metadata(layout.METADATA_NAME)
         for record in container.records():
             if isinstance(record, Block):
                 contents.add_block(record)

@@ -72,6 +72,8 @@ def _no_option(name: str) -> str:
     for option, holder in (("limits", Limits), ("workspace", Workspace)):
         if name in holder.__dataclass_fields__:
             return f"'{name}' belongs to the option {option}: write it in hb.{holder.__name__}(…)"
+    if name in ("grip", "as_is"):
+        return f"'{name}' belongs to the scene: write hb.load_scene(…, {name}=…) for it"
     return f"a bridge has no option '{name}'; it has {choices(BridgeOptions.__dataclass_fields__)}"
 
 

@@ -34,13 +34,21 @@ MOTOR_FORCE = 0.1
 def motor_faults(case: CompiledScene) -> Iterator[Fault]:
     """Yields actuators that push at the start with more than holds gravity and springs.
 
-    The strongest one comes first.
+    The strongest one comes first. None pushes that only brakes: against the motion, and without
+    force at rest.
     """
     model, data = case.model, case.scene.data
     case.scene.reset()
     own = [i for i in range(model.nactuator) if i not in added_actuators(model)]
     parts = {i: _joint_forces(model, data, i) for i in own}
-    total = sum(parts.values(), np.zeros(model.nv))
+    brakes = [i for i in own if float(parts[i] @ data.qvel) < 0.0]
+    if brakes:
+        data.qvel[:] = 0.0
+        mujoco.mj_forward(model, data)
+        brakes = [i for i in brakes if not _joint_forces(model, data, i).any()]
+        case.scene.reset()
+    own = [i for i in own if i not in brakes]
+    total = sum((parts[i] for i in own), np.zeros(model.nv))
     held = data.qfrc_bias - data.qfrc_passive
     excess = total - np.clip(total, np.minimum(held, 0.0), np.maximum(held, 0.0))
     for actuator in sorted(own, key=lambda i: -float(np.linalg.norm(parts[i]))):

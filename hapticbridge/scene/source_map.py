@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 from typing import Any
 
 import mujoco
@@ -58,9 +59,10 @@ class Place:
 class Places:
     """Finder of the lines of a compiled scene's elements.
 
-    MuJoCo records lines of the main file, but not of included files. There an element is found by
-    its name. An unnamed element is found by its position among the unnamed elements of its kind,
-    provided that their numbers in files and model agree.
+    MuJoCo records lines of the main file and, without the file's name, of attached models, but not
+    of included files. There an element is found by its name. An unnamed element is found by its
+    position among the unnamed elements of its kind, provided that their numbers in files and model
+    agree.
     """
 
     def __init__(self, source: SceneSource, model: mujoco.MjModel) -> None:
@@ -75,6 +77,13 @@ class Places:
             if file.name.lower().endswith(".xml")
         ]
         self._main = self._files[0][0] if self._files else source.path.name
+        models = {
+            PurePosixPath(element.attributes.get("file", "")).name
+            for _, elements in self._files
+            for element in elements
+            if element.tag == "model"
+        }
+        self._attached = {name for name, _ in self._files if PurePosixPath(name).name in models}
 
     def geom(self, geom_id: int) -> Place:
         """Returns the place of a geom."""
@@ -140,15 +149,18 @@ class Places:
         """Returns the first element of any tag that has an attribute."""
         return self._first((), lambda element: attribute in element.attributes)
 
-    def attributes_at(self, place: Place) -> dict[str, str]:
-        """Returns the attributes written at a place, without inherited defaults."""
-        for name, elements in self._files:
-            for element in elements:
-                if (name, element.line) == (place.file, place.line) and (
-                    _describe(element) == place.element or place.element.startswith(element.tag)
-                ):
-                    return element.attributes
-        return {}
+    def may_set(self, tag: str, attribute: str, place: Place) -> bool:
+        """Returns False if neither the element at a place nor a default class sets an attribute.
+
+        True for an element that was not found in the files if any of its tag sets it.
+        """
+        return any(
+            not place.line or k < defaults or (name, element.line) == (place.file, place.line)
+            for name, elements in self._files
+            for defaults in [len(elements) - len(_outside_defaults(elements))]
+            for k, element in enumerate(elements)
+            if element.tag == tag and attribute in element.attributes
+        )
 
     def _owner(self, body_id: int) -> str:
         if body_id == 0:
@@ -165,9 +177,8 @@ class Places:
         elements = list(getattr(self._spec, _LISTS.get(kind, f"{kind}s")))
         if index >= len(elements) or not self._has_numbers_of(kind, elements, index):
             return Place(self._main, 0, label)
-        line = _line(elements[index])
-        if line:
-            return Place(self._main, line, label)
+        if _line(elements[index]):
+            return Place(*self._recorded(elements[index], tags), label)
         nameless = [k for k, e in enumerate(elements) if not e.name and not _line(e)]
         included = [
             (file, element.line)
@@ -178,6 +189,20 @@ class Places:
         if index in nameless and len(nameless) == len(included):
             return Place(*included[nameless.index(index)], label)
         return Place(self._main, 0, label)
+
+    def _recorded(self, element: Any, tags: tuple[str, ...]) -> tuple[str, int]:
+        """Returns file and line of an element whose line MuJoCo recorded; line 0 if in doubt."""
+        line, name = _line(element), str(element.name)
+        if not self._attached:
+            return self._main, line
+        found = {
+            file
+            for file, those in self._files
+            for each in those
+            if file in {self._main, *self._attached} and each.line == line and each.tag in tags
+            if _may_become(each.attributes.get("name", ""), name)
+        }
+        return (found.pop(), line) if len(found) == 1 else (self._main, 0)
 
     def _has_numbers_of(self, kind: str, elements: list[Any], index: int) -> bool:
         """Returns False if elements up to this one were fused or dropped by the compiler."""
@@ -201,6 +226,11 @@ class Places:
 def _describe(element: Element) -> str:
     name = element.attributes.get("name")
     return f"{element.tag} '{name}'" if name else f"<{element.tag}>"
+
+
+def _may_become(name: str, compiled: str) -> bool:
+    """Returns True if attaching or replicating, which add to a name, may give the compiled one."""
+    return name in compiled and bool(name) == bool(compiled)
 
 
 def _line(element: Any) -> int:
