@@ -3,137 +3,38 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from audit_cases import recorded
-from kernel_runs import T, load, unlimited
+from kernel_runs import T, load
+from tapping import (
+    COUPLING,
+    DAMPING,
+    SPARE,
+    Tapping,
+    onset,
+    parameters_of,
+    spectral_error,
+    stiff_onset,
+    tapping,
+    towards,
+    wall,
+)
 
 from hapticbridge.audit import audit
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import Limits
-from hapticbridge.demand.methods import METHODS, prepare
+from hapticbridge.demand.methods import METHODS
 from hapticbridge.device.simulated.device import SimulatedDevice
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.kernel.parameters import GuardParameters, RunParameters
-from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
-from hapticbridge.kernel.state import BoundKernel
-from hapticbridge.kernel.tick import set_external_flags, whole_tick
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.tick import whole_tick
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.run.options import PULSES, BridgeOptions, pulse_of
-
-WALL = """
-<mujoco>
-  <option gravity="0 0 0"/>
-  <default><geom friction="0"/></default>
-  <worldbody>
-    <geom type="box" size="0.02 0.2 0.2" pos="0.06 0 0"/>
-    <body name="tool"><freejoint/><geom size="0.02" mass="0.1"/><site name="grip"/></body>
-  </worldbody>
-</mujoco>"""
-GAP = 0.02
-"""Way in m from the tool's start to the wall."""
-
-DAMPING, SPARE = 4.0, 3.0
-"""b and b_s of the device in N s/m; the coupling needs the difference."""
-
-COUPLING = Coupling(2.0 * (DAMPING - SPARE) / T * (1 - 1e-9), 0.0, 1.0, 0.0)
-
-
-@dataclass
-class Tapping:
-    """A device of 0.2 kg at a wall, integrated in steps of T/20, with a ledger of its own.
-
-    Attributes:
-        kernel: The bound kernel.
-        delays: Ticks from a force to when it acts, one of them drawn in each tick.
-        drawn: Work in J that the hand has got so far; negative if it did work.
-        most: Largest ``drawn`` so far, beyond what the scene's storage gave.
-    """
-
-    kernel: BoundKernel
-    period: float = T
-    delays: tuple[int, ...] = (0,)
-    drawn: float = 0.0
-    most: float = 0.0
-
-    MASS = 0.2
-
-    def __post_init__(self) -> None:
-        self.position = self.velocity = 0.0
-        self.sent, self.rows = [0.0] * 64, list[Any]()
-        self.sample = np.zeros(1, SAMPLE_DTYPE)
-        self.sample["quaternion"][0, 0] = 1.0
-        self.rng = np.random.default_rng(0)
-
-    def tick(self, hand: Any, is_stale: bool = False) -> Any:
-        """Runs a tick, then the device for a period with a hand of force ``hand(row, v)`` in N."""
-        set_external_flags(self.kernel.state[0]["loop"], int(TickFlag.STALE_SAMPLE) * is_stale)
-        if not is_stale:
-            self.sample["position"][0, 0] = self.position
-        assert whole_tick(self.kernel.state, self.sample, self.kernel.row, self.period)
-        row = self.kernel.row[0].copy()
-        self.rows.append(row)
-        self.sent.append(float(row["wrench_on_device"][0]))
-        force = self.sent[-1 - int(self.rng.choice(self.delays))]
-        step = self.period / 20
-        for _ in range(20):
-            push = hand(row, self.velocity)
-            # exact for a constant force within the step
-            decay = math.exp(-DAMPING * step / self.MASS)
-            end = (force + push) / DAMPING
-            moved = end * step + (self.velocity - end) * (1 - decay) * self.MASS / DAMPING
-            self.velocity = end + (self.velocity - end) * decay
-            self.position += moved
-            self.drawn -= push * moved
-        stored = row["kinetic"] + row["potential"]
-        kinetic = 0.5 * self.MASS * self.velocity**2
-        self.most = max(self.most, self.drawn + kinetic + min(stored, 0.0))
-        return row
-
-    @property
-    def pulse(self) -> Any:
-        return self.kernel.state["impact"][0]
-
-    @property
-    def ticks(self) -> Any:
-        return np.array(self.rows)
-
-
-def parameters_of(scene: Any, **changes: Any) -> RunParameters:
-    method = METHODS["implicit"]
-    guard = GuardParameters(has_hand=True, fade_ticks=20, speed=10.0)
-    guard = replace(guard, **changes.pop("guarding", {}))
-    standard: dict[str, Any] = {
-        "scheme": method.scheme,
-        "is_rigid": True,
-        "device_damping": DAMPING,
-        "device_rotational_damping": 1.0,
-        "force_limit": 10.0,
-        "impact_pulses": 1.0,
-        "pulse_frequency": 30.0,
-        "pulse_decay": 0.0167,
-        "pulse_damping": SPARE,
-        "guarding": guard,
-    }
-    return replace(unlimited(scene, COUPLING), **(standard | changes))
-
-
-def tapping(
-    delays: tuple[int, ...] = (0,), coupling: Coupling = COUPLING, **changes: Any
-) -> Tapping:
-    scene = load(WALL)
-    prepare(scene, coupling, T, 1, METHODS["implicit"], warns=False)
-    parameters = replace(parameters_of(scene, **changes), coupling=coupling)
-    return Tapping(BoundKernel(scene.model, scene.data, parameters), delays=delays)
-
-
-def towards(speed: float) -> Any:
-    """Returns a hand that holds a speed in m/s, as well as 6 N s/m can."""
-    return lambda row, v: DAMPING * speed + 6.0 * (speed - v)
 
 
 def struck(taps: Tapping, speed: float, ticks: int = 40) -> Any:
@@ -333,7 +234,23 @@ def test_a_changed_coupling_leaves_no_spare_damping() -> None:
 
 
 def taps_parameters() -> RunParameters:
-    return parameters_of(load(WALL))
+    return parameters_of(load(wall()))
+
+
+# The onset, beside that of a wall of ten times the stiffness
+
+
+@pytest.mark.parametrize("speed", [0.1, 0.2, 0.3, 0.4])
+@pytest.mark.parametrize("name", ["wood", "rubber"])
+def test_a_pulse_halves_the_error_of_a_tap_on_a_wall_of_1_kn_per_m(speed: float, name: str) -> None:
+    coupling, gap = Coupling(1000.0, 0.0, 1.0, 0.0), 0.06
+    target = stiff_onset(coupling, speed, gap)
+    frequency, decay = PULSES[name]
+    plain = tapping((0,), coupling, gap, impact_pulses=0.0, pulse_damping=0.0)
+    crisp = tapping((0,), coupling, gap, pulse_frequency=frequency, pulse_decay=decay)
+    without = spectral_error(onset(plain, speed, gap), target)
+    assert without > 0.85
+    assert spectral_error(onset(crisp, speed, gap), target) < 0.5 * without
 
 
 # Options
@@ -369,7 +286,7 @@ def test_runs_that_have_no_pulses_refuse_them(
 def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     folder = tmp_path_factory.mktemp("pulse")
     scene, motion = folder / "wall.xml", folder / "tap.csv"
-    scene.write_text(WALL)
+    scene.write_text(wall())
     motion.write_text(
         "t,x,y,z,qw,qx,qy,qz\n0,0,0,0,1,0,0,0\n0.2,0.05,0,0,1,0,0,0\n"
         "0.3,0,0,0,1,0,0,0\n0.45,0.05,0,0,1,0,0,0\n"
