@@ -729,6 +729,7 @@ def _record(s: State, r: State) -> None:
     r.injected_rotational_damping = s.observer.injected_rotational_damping
     r.lever = s.guard.lever
     r.contact_tank = s.contact.tank
+    r.scene_step, r.scene_tank = s.shown.scene_step, s.shown.tank
     blow = s.impact
     store_vector(r.pulse, vector_of(blow.newest))
     r.pulse_account, r.blow_energy = blow.account, blow.blow_energy
