@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from audit_cases import recorded
+from audit_cases import ScriptedDevice, recorded, verdict_of
 from kernel_runs import T, load
 from tapping import (
     COUPLING,
@@ -34,6 +35,8 @@ from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.tick import whole_tick
 from hapticbridge.recording import Recording, read_recording
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.commands import Couple
 from hapticbridge.run.options import PULSES, BridgeOptions, pulse_of
 
 
@@ -313,3 +316,57 @@ def test_a_recorded_run_is_strict_certified_and_audited_to_the_bit(run: Recordin
     assert report.resimulation == "bit for bit"
     assert np.count_nonzero(run.ticks["blow_energy"]) >= 2
     assert np.abs(run.ticks["pulse"]).max() > 0.3
+
+
+@pytest.mark.parametrize("case", ["late device", "changed coupling", "missing samples"])
+def test_pulses_of_other_devices_are_audited_to_the_bit(tmp_path: Path, case: str) -> None:
+    scene, path = tmp_path / "wall.xml", tmp_path / "run.mcap"
+    scene.write_text(wall())
+
+    def pose(tick: int) -> tuple[float, ...]:
+        return (0.0125 * (1 - math.cos(0.03 * tick)), 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+    sheet: dict[str, Any] = {"damping": DAMPING}
+    if case == "late device":
+        sheet["delay"] = 2 * T
+    if case == "missing samples":
+        sheet["is_stale"] = lambda tick: tick % 7 == 3
+    device = ScriptedDevice(pose, **sheet)
+
+    def note(bridge: Bridge, tick: int) -> None:
+        if case == "changed coupling" and tick == 150:
+            bridge.command(Couple(450.0, 0.2))
+
+    recorded(
+        path,
+        scene,
+        device,
+        Coupling(500.0, 0.2, 1.0, 5e-4),
+        duration=0.7,
+        on_tick=note,
+        impact_pulses=1.0,
+        pulse="60,10",
+        limits=Limits(force=8.0, torque=0.5),
+    )
+    ticks, report = read_recording(path).ticks, audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit"), report.reason
+    assert np.count_nonzero(ticks["pulse"][:, 0]) > 5
+
+
+def test_forged_pulses_are_found_by_the_account_alone(run: Recording, tmp_path: Path) -> None:
+    versions = {"versions": json.dumps({"mujoco": "3.0"})}  # nothing is simulated again
+    for field, changed, factor in (
+        ("pulse_account", ("pulse_account",), 1.01),
+        ("pulse_account", ("blow_energy",), 0.5),
+        ("wrench_on_device", ("pulse",), 0.5),
+        ("pulse", ("pulse", "wrench_on_device"), 3.0),
+    ):
+        rows = run.ticks.copy()
+        more = (factor - 1.0) * rows["pulse"]
+        for name in changed:
+            if name == "wrench_on_device":
+                rows[name][:, :3] += more
+            else:
+                rows[name] *= factor
+        report = verdict_of(run, tmp_path, ticks=rows, meta=versions)
+        assert (report.verdict, report.port) == ("invalid", field)
