@@ -18,6 +18,8 @@ from hapticbridge.recording import Recording, read_recording
 from hapticbridge.report import write_report
 from hapticbridge.report.evidence import Blow, Evidence, blows_of
 from hapticbridge.report.page import MAX_BLOWS, blow_row
+from hapticbridge.run.summary import Summary
+from hapticbridge.units import format_energy
 
 DROP, BALL, PADDLE, DAMPING = 0.1, 0.02, 0.5, 0.1
 """Way of the fall in m, masses in kg, damping ratio of the contact."""
@@ -38,12 +40,12 @@ SCENE = f"""
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+def summary(tmp_path_factory: pytest.TempPathFactory) -> Summary:
     folder = tmp_path_factory.mktemp("ball")
     scene, path, motion = folder / "ball.xml", folder / "ball.mcap", folder / "rest.csv"
     scene.write_text(SCENE)
     motion.write_text("t,x,y,z,qw,qx,qy,qz\n0,0,0,0,1,0,0,0\n2,0,0,0,1,0,0,0\n")
-    recorded(
+    return recorded(
         path,
         scene,
         SimulatedDevice(damping=4.0, path=str(motion)),
@@ -53,7 +55,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
         controller=None,
         limits=Limits(force=8.0, torque=0.5),
     )
-    return read_recording(path)
+
+
+@pytest.fixture(scope="module")
+def run(summary: Summary) -> Recording:
+    assert summary.recording is not None
+    return read_recording(summary.recording)
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +83,16 @@ def test_a_ball_on_a_held_paddle_is_strict_and_bounces_as_asked(
     # the next blow comes after a flight of 2 e v/g, while the paddle is nearly at rest
     flight = 2 * E * first.speed / 9.81
     assert blows[1].time - first.time == pytest.approx(flight, rel=0.1)
+
+
+def test_the_summary_has_what_blows_paid_and_what_pulses_did(
+    summary: Summary, blows: list[Blow]
+) -> None:
+    assert summary.pulses is not None
+    paid, worked = summary.pulses
+    assert paid == pytest.approx(sum(blow.paid for blow in blows), rel=1e-6)
+    assert worked == pytest.approx(sum(blow.worked for blow in blows), abs=1e-6)
+    assert f"paid {format_energy(paid)} by blows" in str(summary)
 
 
 def test_the_energies_of_a_blow_are_those_of_two_bodies(blows: list[Blow]) -> None:

@@ -614,6 +614,12 @@ class RunSetup(StepTimes):
         """Couplings that may be selected during the run."""
         return CouplingLimits(loop=self.loop, start=self.attainable, limits=self.limits)
 
+    @property
+    def pulse_damping(self) -> float:
+        """Damping in N s/m that the device has for pulses, beyond what the coupling needs."""
+        own, _ = self.info.dissipating_damping
+        return max((own or 0.0) - self.loop.needs()[0], 0.0) if self.impact_pulses else 0.0
+
     def holding(self, start: NDArray[np.void], effective: Coupling | None) -> RunParameters:
         """Returns the parameters of a run that starts now and whose device can hold the tool.
 
@@ -727,9 +733,7 @@ class RunSetup(StepTimes):
             impact_pulses=self.impact_pulses,
             pulse_frequency=self.pulse[0],
             pulse_decay=self.pulse[1],
-            pulse_damping=max((damping or 0.0) - self.loop.needs()[0], 0.0)
-            if self.impact_pulses
-            else 0.0,
+            pulse_damping=self.pulse_damping,
         )
 
     def _loaded(self, parameters: RunParameters) -> RunParameters:
