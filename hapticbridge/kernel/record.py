@@ -109,7 +109,9 @@ part of the force on the device that answers a blow, in the device's frame, and 
 the energy in J that may still pay for it (``kernel.impact_pulse``). ``blow_energy`` is the energy
 in J that the tool's blows of the tick took from the bodies; of the largest one, ``blow_speed`` is
 the normal speed in m/s, ``blow_restitution`` the coefficient of restitution that its contact asks
-for, and ``blow_rebound`` the one that it had; all are 0 without a blow."""
+for, and ``blow_rebound`` the one that it had; all are 0 without a blow. Of several hands, the tool
+of the first one counts; of a slower scene none. A contact that does not bounce is noted with
+pulses alone."""
 
 PLANES = 16
 """Largest number of surfaces near a tool that stop it between two of its poses."""
