@@ -52,6 +52,9 @@ HANDS = 5
 WANDERS, SHAKES, TREMBLES = 0, 3, 4
 """Kinds of hands that do not stretch the coupling and then follow."""
 
+REAPS = 5
+"""Kind of a hand that flees along each pulse of a blow, and then strikes there again."""
+
 CHUNK = 50
 """Ticks between two decisions of the hand about buttons and coupling."""
 
@@ -63,6 +66,9 @@ HAND_DTYPE = np.dtype(
         ("net", "<f8"),
         ("most", "<f8"),
         ("credit", "<f8"),
+        ("pulse", "<f8", 3),
+        ("wall", "<f8", 3),
+        ("flees", "<i8"),
         ("saturated", "<i8"),
         ("tick", "<i8"),
         ("due", "<i8"),
@@ -122,10 +128,14 @@ def _move(
     elif kind == TREMBLES:  # without memory
         for i in range(3):
             d[i], t[i] = 1e-3 * speed * normals[2 * i], 5e-3 * normals[2 * i + 1]
+    elif kind == REAPS and h.flees:
+        d[:] = h.pulse * (pace * FASTEST * period / np.sqrt(np.sum(h.pulse**2)))
     elif step < push:  # stretches, waits, then follows the force (1), or the tool alone (2)
         if step == 0:
             h.velocity[:] = normals
             h.velocity[min(axes, 3) : 3] = 0.0
+            if kind == REAPS:
+                h.velocity[:3] += 10.0 * h.wall
             h.velocity[:3] *= speed / np.sqrt(np.sum(h.velocity[:3] ** 2))
         d[:], t[:] = h.velocity[:3] * period, h.velocity[3:] * period
     elif step >= push + hold:
@@ -152,6 +162,10 @@ def _move_device(
     period, b, b_r = s.run.period, habits[2], habits[3]
     w = np.zeros(6)
     w[:] = s.loop.wrench_on_device
+    h.pulse[:] = s.impact.newest
+    if np.any(h.pulse != 0.0) and not h.flees:  # it first points away from what was struck
+        h.wall[:] = -h.pulse / np.sqrt(np.sum(h.pulse**2))
+    h.flees = np.any(h.pulse != 0.0)
     _shorten(w[:3], habits[4])
     _shorten(w[3:], habits[5])
     d, t = _move(h, w, habits, period, normals)
@@ -248,6 +262,9 @@ class Attack:
         is_limited_alone: True limits the force on the device alone, as a bridge must not.
         is_posted: True lets another program show its tool (``posting_program``), which may give
             the hand no more than its credit.
+        impact_pulses: Share of a blow's energy for pulses; the device then has spare damping, and
+            one hand in two flees along the pulses.
+        pays_pulses: False sends pulses that no blow has paid for, as a bridge must not.
         allowed: Share of that credit that a hand may have; less shows how much of it hands get.
     """
 
@@ -266,6 +283,8 @@ class Attack:
     pays: bool = True
     is_limited_alone: bool = False
     is_posted: bool = False
+    impact_pulses: float = 0.0
+    pays_pulses: bool = True
     allowed: float = 1.0
 
     @classmethod
@@ -290,11 +309,12 @@ class Attack:
         b = float(rng.choice([0.5, 2.0, 5.0]))
         b_r = 1e-3 * b
         gain, gain_r = self.scale * self.force_scale, self.force_scale / self.scale
-        strongest = self._coupling(rng, b / gain, b_r / gain_r, 1.0)
+        pulses = self._pulses(b, period)
+        strongest = self._coupling(rng, (b - pulses["pulse_damping"]) / gain, b_r / gain_r, 1.0)
         limits = 10 ** rng.uniform(-0.5, 1.2), 10 ** rng.uniform(-2.0, -0.3)
         mass = 10 ** rng.uniform(-1.5, 0.0)
-        values: dict[str, Any] = {"mass": mass} if self.scene in HEAVY else {}
         credit = 10 ** rng.uniform(-3.0, -0.5) if self.is_posted else 0.0
+        values: dict[str, Any] = {"mass": mass} if self.scene in HEAVY else {}
         scene = posted_scene(credit) if self.is_posted else load_scene(self.scene, **values)
         step = period * max(self.scene_ticks, 1)
         prepare(scene, strongest, step, 1, method, warns=False)
@@ -316,6 +336,7 @@ class Attack:
             is_rigid=method.is_rigid,
             device_damping=b,
             device_rotational_damping=b_r,
+            **pulses,
             scene_ticks=self.scene_ticks,
             credit=credit,
             guarding=GuardParameters(
@@ -338,7 +359,7 @@ class Attack:
         habits = np.array(
             [
                 self.axes,
-                self.kind,
+                REAPS if self.impact_pulses and self.seed % 2 else self.kind,
                 b,
                 b_r,
                 *limits,
@@ -350,11 +371,8 @@ class Attack:
                 self.scene_ticks,
             ]
         )
-        draw = np.random.default_rng([self.seed, 2])
-        program = None
-        if self.is_posted:
-            own_choices = np.random.default_rng([self.seed, 3])
-            program = PostingProgram(own_choices, period, kernel)
+        draw, chooses = (np.random.default_rng([self.seed, i]) for i in (2, 3))
+        program = PostingProgram(chooses, period, kernel) if self.is_posted else None
         code = OK
         for _ in range(ticks // CHUNK):
             if self.presses and rng.random() < 0.1:
@@ -369,10 +387,22 @@ class Attack:
                 if self.scene_ticks and not self.is_posted:
                     ticks = max(round(0.02 / step), 1)
                     slow.tune(goal.of_scene, method.gains(law, step), ticks)
+            if not self.pays_pulses:
+                kernel.state["impact"]["account"] = 1e9
             code = _attack(states, own, hand, habits, draw, program)
             if code != OK:
                 break
         return float(hand["most"][0]), int(hand["saturated"][0]), code
+
+    def _pulses(self, b: float, period: float) -> dict[str, Any]:
+        """Returns the pulses of a run, and the damping of b that is spare for them."""
+        rng = np.random.default_rng([self.seed, 4])
+        return {
+            "impact_pulses": self.impact_pulses,
+            "pulse_frequency": float(rng.uniform(0.0, 0.5) / period),
+            "pulse_decay": float(10 ** rng.uniform(-3.0, -1.0)),
+            "pulse_damping": b * float(rng.choice([0.0, 0.3, 0.8])) if self.impact_pulses else 0.0,
+        }
 
     def _coupling(self, rng: np.random.Generator, b: float, b_r: float, share: float) -> Coupling:
         """Returns a coupling that needs at most a share of the damping b."""

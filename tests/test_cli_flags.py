@@ -57,12 +57,21 @@ def flag_of(kind: Any, each: Field[Any]) -> Flag:
     return flag
 
 
+OF_THEIR_OWN = {
+    "axes": "0 -1 0 1 0 0 0 0 1",
+    "scene_rate": "500",
+    "impact_pulses": "0.5",
+    "pulse": "250,8",
+}
+"""Values of flags by the last part of their path, where the type and rule do not tell one."""
+
+
 def text_for(flag: Flag) -> list[str]:
     """Returns words for a value of a flag's type that its rule admits."""
     kinds = flag.of_tuple[:1] or members(flag.kind)
     if get_origin(kinds[0]) is Literal:
         return [get_args(kinds[0])[0]]
-    if (own := {"axes": "0 -1 0 1 0 0 0 0 1", "scene_rate": "500"}.get(flag.path[-1])) is not None:
+    if (own := OF_THEIR_OWN.get(flag.path[-1])) is not None:
         return own.split()
     if int in kinds or float in kinds:
         rule = flag.rule

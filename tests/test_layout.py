@@ -232,6 +232,7 @@ WRITERS = {
     "contact": "rigid_contact",
     "shown": "shown_tool",
     "timing": "timing",
+    "impact": "impact_pulse",
 }
 """Sub-records of the kernel's state, and the module of the kernel that writes each."""
 

@@ -132,6 +132,7 @@ RUNS: dict[str, Callable[[Path], Bridge]] = {
     ),
     "some gains and substeps": one_hand(coupling={"stiffness": 700.0}, substeps=3),
     "a slower scene": one_hand(scene_rate=250.0),
+    "pulses": one_hand(impact_pulses=0.5, pulse="steel"),
     "absolute poses": one_hand(workspace=Workspace(absolute=True)),
     "a massless tool": one_hand(method="direct", contact_stiffness=300.0),
     "a real device": one_hand(clock=RealTime, sheet=REAL, live=True, realtime=True, probe=False),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.events import AuditState, RunEvents
 from hapticbridge.audit.motion import Array, Motion, turn_between
+from hapticbridge.audit.pulse import PulseBalance
 from hapticbridge.audit.spring import Spring, springs
 from hapticbridge.audit.structure import TOLERANCE, Deviation
 from hapticbridge.audit.wrench_limits import (
@@ -167,10 +168,10 @@ class EnergyBalance:
         environment_energy: S_k − S_start − works, with the ``coupling_work`` above, (n,) in J.
         slack: Σ ½ (K + B'/T) ‖δx‖² + ½ (K_r + B'_r/T) ‖δφ‖² below the force level, (n,) in J.
         excess_device_energy: Energy given to the device beyond its dissipation, what steps of the
-            encoder may have added, the energy released by scene and coupling since the start, and
-            the unfelt work (``unfelt_work``), (n,) in J. Zero for an unknown damping or several
-            laws per tick. With a coupling law, energy created by the environment is not included;
-            it belongs to the other port.
+            encoder may have added, the energy released by scene and coupling since the start, the
+            unfelt work (``unfelt_work``) and that of pulses, (n,) in J. Zero for an unknown damping
+            or several laws per tick. With a coupling law, energy created by the environment is not
+            included; it belongs to the other port.
         net_energy: Energy given to the hand beyond what the device's damping burned, less what the
             scene's storage had given before the tick (``released``) and what steps of the encoder
             may have added, (n,) in J; zero without a hand. It is what the guard's energy limit
@@ -188,6 +189,7 @@ class EnergyBalance:
         released: Energy in J that the scene's storage has given to the hand after the last tick.
         contact_tank: Energy that may pay for the depenetration of rigid contacts, (n,) in J; zero
             with the contacts of the scene.
+        pulses: Energies of the pulses of blows.
         sums: Cumulative energies after the last of these ticks, for ``AuditState``.
     """
 
@@ -207,6 +209,7 @@ class EnergyBalance:
     input_work: Array
     released: float
     contact_tank: Array
+    pulses: PulseBalance
     sums: dict[str, float]
 
     @classmethod
@@ -260,12 +263,16 @@ class EnergyBalance:
         totals |= {"motors": ticks["actuator_work"], "external": ticks["external_work"]}
         totals |= _released(totals, before, stored - others_work, is_reset)
         ratio = parameters.force_scale / parameters.scale
+        pulses = PulseBalance.of(block, events, created)
+        totals |= pulses.sums
         net, unpaid = _hand_energies(parameters, totals, before, is_reset)
-        stretched = motion.stretch, motion.twist
-        held = stored_in_springs(parameters, gains, stretched) - totals["start_springs"]
-        # D_k = min(cap, D_{k-1} - E_k) is the lowest cap + Σ E so far, or 0, minus Σ E
+        held = stored_in_springs(parameters, gains, (motion.stretch, motion.twist))
+        held = held - totals["start_springs"]
+        # D_k = min(cap, D_{k-1} - E_k) is the lowest cap + Σ E so far, or 0, minus Σ E; what
+        # pulses take counts as E
+        spent = created + pulses.taken
         ceiling = np.minimum(
-            np.minimum.accumulate(parameters.tank_cap + created), before["tank_ceiling"]
+            np.minimum.accumulate(parameters.tank_cap + spent), before["tank_ceiling"]
         )
         totals["tank_ceiling"] = ceiling
         return cls(
@@ -280,12 +287,13 @@ class EnergyBalance:
             hidden_energy=float(totals["hidden_energy"][-1]) * parameters.guarding.has_hand,
             gross_energy=(totals["hand_energy"] - totals["unfelt_work"])
             * parameters.guarding.has_hand,
-            unpaid_energy=unpaid * parameters.guarding.has_hand,
+            unpaid_energy=(unpaid - pulses.paid(before)) * parameters.guarding.has_hand,
             coupling_account=ratio * (coupling_work + held),
             springs=float(ratio * totals["start_springs"][-1]),
             input_work=totals["inputs"],
             released=float(totals["released"][-1]),
-            contact_tank=(ceiling - created) * (parameters.is_rigid and not parameters.scene_ticks),
+            contact_tank=(ceiling - spent) * (parameters.is_rigid and not parameters.scene_ticks),
+            pulses=pulses,
             sums={name: float(total[-1]) for name, total in totals.items()},
         )
 
@@ -391,7 +399,11 @@ def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict
     whole[np.isin(ticks["tick"], events.resumed)] = 0.0
     gains = events.gains(ticks["tick"])
     unfelt = unfelt_work(parameters, gains, whole, rows["lever"][: len(ticks)], (moved, turned))
-    late = np.sum(sent[:, :3] * late_moved, axis=1) + np.sum(sent[:, 3:] * late_turned, axis=1)
+    pulses = np.where(
+        np.isin(ticks["tick"], events.resumed)[:, None], 0.0, rows["pulse"][: len(ticks)]
+    )
+    late = np.sum((sent[:, :3] - pulses) * late_moved, axis=1)
+    late += np.sum(sent[:, 3:] * late_turned, axis=1)
     dissipation, guarding = np.zeros(len(ticks)), parameters.guarding
     if parameters.device_damping is not None:
         parts = dissipated_by_damping(
@@ -551,6 +563,7 @@ def energy_deviations(block: AuditedBlock, balance: EnergyBalance) -> Iterator[D
         size = throughput + np.abs(ticks["potential"]) + np.abs(balance.environment_energy)
         allowed = TOLERANCE * (1 + size)
         yield Deviation(name, amount, allowed, "J", "recorded poses and wrenches")
+    yield from balance.pulses.deviations(block)
     if block.scene_ticks:
         yield from _shown_deviations(block, balance)
         return

@@ -6,6 +6,7 @@ kernel; here they become arrays over ticks.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -107,6 +108,11 @@ class RunEvents:
             value = np.where(share > 0, start + share * (goal - start), value)
             start = start + min(max((later - begin) / length, 0.0), 1.0) * (goal - start)
         return value
+
+    @property
+    def first_change(self) -> float:
+        """Tick of the first change of the coupling; inf without one."""
+        return float(self._began[0]) if len(self._began) else math.inf
 
     def buttons(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
         """Returns the bits of ``buttons`` that commands set in some ticks."""
@@ -307,6 +313,11 @@ SUMS = (
     "sent_x",
     "sent_y",
     "sent_z",
+    "pulse_account",
+    "pulse_earned",
+    "pulse_work",
+    "pulse_taken",
+    "pulse_size",
 )
 """Names of the cumulative energies, and of the force in N that the device held last."""
 
@@ -321,6 +332,7 @@ class AuditState:
         since_sample: Time in s that the device has been without a new sample.
         rise_ticks: Ticks in which the share of the wrench rises from 0 to 1.
         start_energy: Kinetic plus potential energy before the first tick, in J.
+        pulses: Pulses on the device in the last ticks, as many as may still act, (d + 1, 3) in N.
         sums: Cumulative energies in J, by the names of ``SUMS``.
     """
 
@@ -328,6 +340,7 @@ class AuditState:
     since_sample: float
     rise_ticks: float
     start_energy: float
+    pulses: Array
     sums: dict[str, float]
 
     @classmethod
@@ -352,5 +365,6 @@ class AuditState:
             since_sample=0.0,
             rise_ticks=float(parameters.ramp_ticks),
             start_energy=float(starts["start_kinetic"][0] + starts["start_potential"][0]),
+            pulses=np.zeros((round(parameters.device_delay / parameters.period) + 1, 3)),
             sums=dict.fromkeys(SUMS, 0.0),
         )

@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.energy import EnergyBalance
 from hapticbridge.audit.motion import Array, turn_between
-from hapticbridge.audit.wrench_limits import AuditedBlock, axes_with_motor, whole_wrench
+from hapticbridge.audit.wrench_limits import (
+    AuditedBlock,
+    axes_with_motor,
+    whole_wrench,
+    without_pulse,
+)
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import TickFlag, has_flag
 
@@ -92,11 +97,11 @@ class TimingTally:
         lateness = 1e-9 * (rows["read_ns"] - rows["deadline_ns"])
         self.jitter += float(np.sum(np.maximum(np.diff(lateness), 0.0)))
         if parameters.has_law:
-            self._add_account(block, balance.coupling_account)
+            self._add_account(block, balance)
 
-    def _add_account(self, block: AuditedBlock, stored: Array) -> None:
+    def _add_account(self, block: AuditedBlock, balance: EnergyBalance) -> None:
         """Adds what late samples and forces may have given."""
-        ticks, parameters = block.ticks, self.parameters
+        ticks, parameters, stored = block.ticks, self.parameters, balance.coupling_account
         is_new = ~has_flag(ticks, TickFlag.STALE_SAMPLE) | block.is_first
         edges = np.unique([0, *np.flatnonzero(block.is_first), len(ticks)])
         rows = np.concatenate([block.state.row, ticks])
@@ -110,11 +115,13 @@ class TimingTally:
             sent = part[chosen]
             delay = round(1e9 * parameters.device_delay)
             self.arrivals = np.concatenate([self.arrivals, sent["write_ns"] + delay])
-            self.wrenches = np.concatenate([self.wrenches, sent["wrench_on_device"]])
+            self.wrenches = np.concatenate([self.wrenches, without_pulse(sent)])
             times = np.concatenate([[self.since], sent["read_ns"]])
             lever = block.lever_before[first:end][chosen]
+            spare = balance.pulses.spare[first:end][chosen]
             change = np.diff(np.concatenate([[self.stored], stored[first:end][chosen]]))
-            steps[first + chosen] = change + self._energy(times, rows[first + chosen], sent, lever)
+            energy = self._energy(times, (rows[first + chosen], sent), lever, spare)
+            steps[first + chosen] = change + energy
             if len(chosen):
                 self.since, self.stored = int(times[-1]), float(stored[first + chosen[-1]])
             last = max(int(np.searchsorted(self.arrivals, self.since, "right")) - 1, 0)
@@ -134,18 +141,19 @@ class TimingTally:
     def _energy(
         self,
         times: NDArray[np.int64],
-        before: NDArray[np.void],
-        samples: NDArray[np.void],
+        records: tuple[NDArray[np.void], NDArray[np.void]],
         lever: Array,
+        spare: Array,
     ) -> Array:
         """Returns E_k + u'_k·δp_k of ``kernel.timing``, (n,) in J.
 
         Args:
             times: Times of the samples, and of the one before them, in ns.
-            before: Records before each sample.
-            samples: Their own records.
+            records: Records before each sample, and its own.
             lever: r_{k−1}, (n,).
+            spare: Damping in N s/m that pulses count on, (n,).
         """
+        before, samples = records
         parameters, guarding = self.parameters, self.parameters.guarding
         time = 1e-9 * np.diff(times)[:, None]
         is_late = (time > _LATE * parameters.period) | (parameters.credit > 0.0)
@@ -166,8 +174,10 @@ class TimingTally:
         motion = np.concatenate([moved, turned], axis=1)
         whole = samples["lever"]
         ratio = np.divide(lever, whole, out=np.zeros_like(whole), where=whole > 0)[:, None]
-        sent = ratio * samples["wrench_on_device"]
-        b = np.repeat([guarding.assumed_damping, guarding.assumed_rotational_damping], 3)
+        sent = ratio * without_pulse(samples)
+        linear = guarding.assumed_damping - spare
+        angular = np.full_like(spare, guarding.assumed_rotational_damping)
+        b = np.repeat(np.stack([linear, angular], axis=1), 3, axis=1)
         middle = np.where(is_late, impulse / time, sent)
         unfelt = ratio * whole_wrench(samples, parameters)
         unfelt = unfelt * (1.0 - axes_with_motor(parameters))

@@ -109,6 +109,9 @@ class AuditedBlock:
             row=row.copy(),
             since_sample=float(self.interval[-1] * has_flag(row, TickFlag.STALE_SAMPLE)[0]),
             rise_ticks=float(self.rise_ticks[-1]),
+            pulses=np.concatenate([self.state.pulses, self.ticks["pulse"]])[
+                -len(self.state.pulses) :
+            ],
             sums=sums,
         )
 
@@ -217,6 +220,13 @@ def whole_wrench(ticks: NDArray[np.void], parameters: RunParameters) -> Array:
     )
 
 
+def without_pulse(ticks: NDArray[np.void]) -> Array:
+    """Returns the wrench on the device without the pulses of blows, (n, 6) in N and N m."""
+    wrench = ticks["wrench_on_device"].copy()
+    wrench[:, _FORCE] -= ticks["pulse"]
+    return wrench
+
+
 def _wrench_deviation(block: AuditedBlock, parameters: RunParameters) -> Deviation:
     """Compares the wrench on the device with the wrench on the tool times the lever.
 
@@ -224,9 +234,9 @@ def _wrench_deviation(block: AuditedBlock, parameters: RunParameters) -> Deviati
     """
     ticks = block.ticks
     expected = whole_wrench(ticks, parameters) * axes_with_motor(parameters)
-    sent = ticks["wrench_on_device"]
+    sent, source = ticks["wrench_on_device"], "wrench on the tool and lever"
     deviation = Deviation.between(
-        "wrench_on_device", sent, expected, "N or N m", "wrench on the tool and lever"
+        "wrench_on_device", without_pulse(ticks), expected, "N or N m", source
     )
     limits = parameters.force_limit, parameters.torque_limit
     rounding = SINGLE if parameters.is_apart else TOLERANCE

@@ -123,6 +123,13 @@ def announce(setup: RunSetup, named: Mapping[str, float], *, is_method_chosen: b
             "  the device is first pushed a little along each axis, to see that it goes the right "
             "way (--no-probe)"
         )
+    if setup.impact_pulses:
+        frequency, decay = setup.pulse
+        err.print(
+            f"  a blow of the tool gives a pulse of {frequency:g} Hz that falls to 37 % in "
+            f"{format_si(decay, 's')}; for it the device has {setup.pulse_damping:.3g} N s/m more "
+            "than the coupling needs"
+        )
     _announce_damping(setup, named)
     _announce_own_rate(setup)
     for sentence in _without_motor(setup):

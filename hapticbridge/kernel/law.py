@@ -505,7 +505,8 @@ def _lateness(s: State, kind: int, interval: float, ticks: int) -> float:
     """
     k, run, pose = s.coupling, s.run, s.pose
     stiffness, damping, across = k.stiffness, k.damping, 0.0
-    b, d = run.device_damping / (run.force_scale * run.scale), vector_of(pose.handle_step)
+    b = (run.device_damping - s.impact.spare) / (run.force_scale * run.scale)
+    d = vector_of(pose.handle_step)
     if kind == 1:
         stiffness, damping = k.rotational_stiffness, k.rotational_damping
         b = run.device_rotational_damping * run.scale / run.force_scale
@@ -551,7 +552,8 @@ def charge_lateness(s: State, interval: float, ticks: int) -> None:
     step in m, t the time in s since the last sample, T the period. The hand has felt a held force
     while the spring was stretched by d; the device burned b ‖d‖²/t. D is below zero for a sample in
     time; a late one pays later, because the handle slips until the springs hold less by D. b in
-    N s/m is the device's damping seen at the handle, at least what the condition needs.
+    N s/m is the device's damping seen at the handle, at least what the condition needs, and without
+    that which pulses count on (``kernel.impact_pulse``).
     """
     if ticks == 1:
         note_tool(s)
@@ -574,6 +576,12 @@ def note_sent(s: State) -> None:
 def forget_sent(coupling: Part) -> None:
     """Forgets the wrenches on their way to the device: it holds none, or the springs are empty."""
     coupling["sent"] = 0.0
+
+
+@compiled
+def owe(s: State, energy: float) -> None:
+    """Charges the springs with an energy in J that something else gave the hand too early."""
+    s.coupling.owed[0] += energy
 
 
 @compiled

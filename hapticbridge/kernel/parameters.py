@@ -283,6 +283,12 @@ class RunParameters(StepTimes):
         is_beside: True for a slower scene's own loop (``of_scene``).
         loop_period: T_b in s of the device's own loop, which renders the coupling to the tool that
             it is shown (``device.own_loop``); 0 for a device that applies the bridge's wrench.
+        impact_pulses: Share of a blow's energy that may pay for a pulse on the device, 0 to 1
+            (``kernel.impact_pulse``).
+        pulse_frequency: f in Hz of the pulses.
+        pulse_decay: τ in s of the pulses.
+        pulse_damping: b_s in N s/m, the damping of the device on which pulses count, beyond what
+            the coupling needs.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -312,6 +318,10 @@ class RunParameters(StepTimes):
     credit: float = option(0.0, unit="J", least=0.0)
     is_beside: bool = False
     loop_period: float = option(0.0, unit="s", least=0.0)
+    impact_pulses: float = option(0.0, least=0.0, most=1.0)
+    pulse_frequency: float = option(0.0, unit="Hz", least=0.0)
+    pulse_decay: float = option(0.01, unit="s", least=0.0, is_open=True)
+    pulse_damping: float = option(0.0, unit="N s/m", least=0.0)
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -330,6 +340,8 @@ class RunParameters(StepTimes):
             raise HapticBridgeError(
                 f"credit is {self.credit!r} J for a scene that steps in every tick; it must be 0"
             )
+        if self.impact_pulses > 0.0:
+            self._check_pulses()
         for name in ("device_origin", "handle_origin", "device_start"):
             pose = getattr(self, name)
             if len(pose) != 7 or not all(math.isfinite(value) for value in pose):
@@ -344,6 +356,20 @@ class RunParameters(StepTimes):
             and np.linalg.det(rotation.reshape(3, 3)) > 0
         ):
             raise _no_rotation(self.axes)
+
+    def _check_pulses(self) -> None:
+        is_direct = self.has_law and not (self.is_joint or self.scene_ticks or self.is_apart)
+        if not (self.is_rigid and is_direct):
+            raise HapticBridgeError(
+                f"impact_pulses is {self.impact_pulses:g}; pulses need rigid contact, a coupling "
+                "law, a tool held at a site, a scene that steps in every tick, and a device "
+                "without a loop of its own"
+            )
+        if self.pulse_frequency > 0.5 / self.period:
+            raise HapticBridgeError(
+                f"pulse is of {self.pulse_frequency:g} Hz; it must be at most half the rate, "
+                f"{0.5 / self.period:g}"
+            )
 
     @property
     def is_joint(self) -> bool:

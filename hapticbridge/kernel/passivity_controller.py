@@ -192,7 +192,7 @@ def foreseen_excess(s: State) -> float:
 
 
 @compiled
-def _largest_power(size: float, damping: float, full_speed: float) -> float:
+def largest_power(size: float, damping: float, full_speed: float) -> float:
     """Returns the largest (w − b u) u in W for 0 <= u <= ``full_speed``."""
     u = full_speed
     if size < 2.0 * damping * full_speed:
@@ -212,8 +212,8 @@ def within_energy_limit(s: State, force: Vector, torque: Vector) -> tuple[Vector
     guard, observer = s.guard, s.observer
     if not math.isfinite(guard.max_energy):
         return force, torque
-    power = _largest_power(norm(force), observer.assumed_damping, guard.full_speed)
-    power += _largest_power(norm(torque), observer.assumed_rotational_damping, FULL_TURN)
+    power = largest_power(norm(force), observer.assumed_damping, guard.full_speed)
+    power += largest_power(norm(torque), observer.assumed_rotational_damping, FULL_TURN)
     allowed = AT_FULL_SPEED * guard.max_energy - observer.guarded_energy
     if not s.run.period * power > allowed:  # also for energies that are not numbers
         return force, torque
@@ -273,7 +273,8 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
         ``max_hand_energy``: largest Σ (w·δp − b ‖δp‖²/t − W_u), of the positions that were read.
         ``max_unpaid_energy``: largest Σ (w·δp − b ‖δp‖²/t − W_u) − q max(V_0 − W_c − P, 0), with
             the springs' energy V_0, the coupling's work W_c and P = max(Σ E, 0); for a device with
-            a loop of its own the largest of the latter part so far.
+            a loop of its own the largest of the latter part so far. Work of pulses is paid for as
+            far as blows did (``kernel.impact_pulse``).
 
     Valid for a wrench that is held constant between ticks, or lies between those of a device's own
     loop at two samples, the least work of which counts. A certified device keeps A <= 0.
@@ -318,8 +319,7 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
         delivered -= s.loop.spread[i] * abs(moved[i]) + s.loop.spread[3 + i] * abs(turned[i])
     observer.hidden_energy += 0.5 * observer.resolution * held
     unfelt = unfelt_work(s, moved, turned)
-    gained -= unfelt
-    observed = observer.observed_energy + (delivered + unburnt) + gained
+    observed = observer.observed_energy + (delivered + unburnt) + (gained - unfelt)
     observer.observed_energy = max(observed, -limit)
     observer.net_device_energy += delivered + unburnt
     observer.hand_energy += delivered - unfelt
@@ -328,7 +328,8 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     paid = (s.run.force_scale / s.run.scale) * max(released, 0.0)
     if s.run.is_apart:  # its tank holds what the scene released, until the hand has got it
         observer.most_paid = paid = max(observer.most_paid, paid)
-    observer.max_unpaid_energy = max(observer.max_unpaid_energy, observer.hand_energy - paid)
+    unpaid = observer.hand_energy - paid - min(s.impact.work, s.impact.earned)
+    observer.max_unpaid_energy = max(observer.max_unpaid_energy, unpaid)
     if observer.first_unpaid < 0 and observer.max_unpaid_energy > INSTANT:
         observer.first_unpaid = s.loop.tick
     observer.guarded_energy = guarded_energy(s)

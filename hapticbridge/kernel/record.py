@@ -86,6 +86,12 @@ TICK_DTYPE = np.dtype(
         ("contact_tank", "<f8"),
         ("scene_step", "<i8"),
         ("scene_tank", "<f8"),
+        ("pulse", "<f8", 3),
+        ("pulse_account", "<f8"),
+        ("blow_speed", "<f8"),
+        ("blow_restitution", "<f8"),
+        ("blow_rebound", "<f8"),
+        ("blow_energy", "<f8"),
     ]
 )
 """One record. Row k holds the sample read in tick k, the wrench computed from it, and the energies
@@ -98,7 +104,14 @@ the wrench that was sent, and of the device's motion to the next sample that the
 ``contact_tank`` is the energy in J that may pay for the depenetration of rigid contacts
 (``kernel.rigid_contact``). ``scene_step`` counts the steps shown so far of a scene that is slower
 than the loop, and ``scene_tank`` is the energy in J that the hand has given and that scene has not
-yet got; both are 0 for a scene that steps in every tick (``kernel.shown_tool``)."""
+yet got; both are 0 for a scene that steps in every tick (``kernel.shown_tool``). ``pulse`` is the
+part of the force on the device that answers a blow, in the device's frame, and ``pulse_account``
+the energy in J that may still pay for it (``kernel.impact_pulse``). ``blow_energy`` is the energy
+in J that the tool's blows of the tick took from the bodies; of the largest one, ``blow_speed`` is
+the normal speed in m/s, ``blow_restitution`` the coefficient of restitution that its contact asks
+for, and ``blow_rebound`` the one that it had; all are 0 without a blow. Of several hands, the tool
+of the first one counts; of a slower scene none. A contact that does not bounce is noted with
+pulses alone."""
 
 PLANES = 16
 """Largest number of surfaces near a tool that stop it between two of its poses."""
@@ -121,7 +134,7 @@ each a normal away from the surface, the arm from the grip to the point of the t
 and the gap there in m. ``work`` in J is all that the coupling has done on the program's tool so
 far, 0 where the program applies no wrench."""
 
-FORMAT = "7"
+FORMAT = "8"
 """Format of a recording: its fields, the request with its options, and the numbers that follow from
 it. A recording of another format is refused, so other fields in any of them need the next number.
 
@@ -173,10 +186,13 @@ _PARTS: dict[str, tuple[tuple[str, ...], str]] = {
     "tool_quaternion": _QUATERNION,
     "wrench_on_tool": _WRENCH,
     "wrench_on_device": _WRENCH,
+    "pulse": (("fx", "fy", "fz"), "N"),
 }
 UNITS = {
     **dict.fromkeys(("tick", "flags", "buttons", "contacts", "solver_iterations"), "1"),
-    **dict.fromkeys(("lever", "scene_step"), "1"),
+    **dict.fromkeys(("lever", "scene_step", "blow_restitution", "blow_rebound"), "1"),
+    **dict.fromkeys(("pulse_account", "blow_energy"), "J"),
+    "blow_speed": "m/s",
     "deadline_ns": "ns",
     "wake_ns": "ns",
     "read_ns": "ns",

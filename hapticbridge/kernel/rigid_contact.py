@@ -763,7 +763,7 @@ def returned_energy(s: State) -> float:
 
 
 @compiled
-def _note_ends(s: State) -> None:
+def note_ends(s: State) -> None:
     """Notes each row's velocity at the end of the step, J v⁺, against surfaces that move."""
     mj = s.mj
     mj_mul_jac(mj.model, mj.data, s.contact.end_velocity, mj.qvel)
@@ -789,7 +789,7 @@ def _has_sunk(s: State) -> bool:
     is_smooth = h * contact.lift <= SUNK and contact.rebound_ratio == 0.0
     if is_smooth or count > MAX_ROWS:
         return False
-    _note_ends(s)
+    note_ends(s)
     ends, contacts = floats(contact.end_velocity, count), pointer_at(mj.contact)
     force = floats(pointer_at(mj.efc_force), count)
     for c in range(ints(mj.ncon, 1)[0]):
@@ -818,7 +818,7 @@ def _misses_force(s: State) -> bool:
     count = ints(mj.nefc, 1)[0]
     if not contact.pressing or count > MAX_ROWS:
         return False
-    _note_ends(s)
+    note_ends(s)
     ends, contacts = floats(contact.end_velocity, count), pointer_at(mj.contact)
     blocked, positions = floats(contact.blocked, MAX_ROWS), floats(pointer_at(mj.efc_pos), count)
     velocities = floats(pointer_at(mj.efc_vel), count)
@@ -996,10 +996,13 @@ def _move_bodies(s: State) -> None:
 
 
 @compiled
-def fill_tank(s: State) -> None:
-    """Adds the energy that the environment dissipated in the tick; takes what it created."""
+def fill_tank(s: State, taken: float) -> None:
+    """Adds the energy that the environment dissipated in the tick; takes what it created.
+
+    ``taken`` is energy in J of the tick that pays for something else (``kernel.impact_pulse``).
+    """
     contact, created = s.contact, s.energy.environment_energy
     if not contact.is_rigid:
         return
-    contact.tank = min(contact.tank - (created - contact.last_energy), contact.cap)
+    contact.tank = min(contact.tank - (created - contact.last_energy) - taken, contact.cap)
     contact.last_energy = created

@@ -1,4 +1,4 @@
-"""The kernel's state, bound to a model and its data: fifteen sub-records, each with one writer.
+"""The kernel's state, bound to a model and its data: sixteen sub-records, each with one writer.
 
 One structured array of one element crosses from Python into the compiled functions: unpacking one
 array costs 0.1 µs, unpacking forty would cost more than MuJoCo's step. Numba hands its sub-records
@@ -21,6 +21,7 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | contact     | tank and share of rigid contacts                  | rigid_contact                 |
 | shown       | shown pose of a slower scene's tool, its tank     | shown_tool                    |
 | timing      | times of samples and forces, their energy         | timing                        |
+| impact      | blows of the tool, pulse on the device, account   | impact_pulse                  |
 """
 
 from __future__ import annotations
@@ -58,6 +59,12 @@ from hapticbridge.kernel.handle import (
     handle_facts,
     move_handle_home,
     set_tool,
+)
+from hapticbridge.kernel.impact_pulse import (
+    IMPACT_DTYPE,
+    bind_pulse,
+    forget_pulses,
+    forgo_spare_damping,
 )
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.law import (
@@ -166,6 +173,7 @@ STATE_DTYPE = np.dtype(
         ("contact", RIGID_DTYPE),
         ("shown", SHOWN_DTYPE),
         ("timing", TIMING_DTYPE),
+        ("impact", IMPACT_DTYPE),
     ]
 )
 """The kernel's state; the module's docstring has a table of its sub-records."""
@@ -281,6 +289,7 @@ class BoundKernel:
         s = self._record
         restart_ramp(s["guard"], int(s["loop"]["tick"]), int(s["run"]["ramp_ticks"]))
         forget_sent(s["coupling"])
+        forget_pulses(s["impact"])
         pause(s["loop"])
 
     def tune(self, parameters: RunParameters, gains: tuple[Gains, Gains], ticks: int) -> None:
@@ -292,6 +301,7 @@ class BoundKernel:
             ticks: Length of the change in ticks, >= 1.
         """
         set_tuning_goal(self._record["coupling"], parameters, gains, ticks)
+        forgo_spare_damping(self._record["impact"])
 
     def command(self, bits: int) -> None:
         """Sets the commands in force from the next tick on, ``FORCE_OFF`` and ``CLUTCHED``."""
@@ -324,6 +334,7 @@ class BoundKernel:
         restore_model(self._model, self._owned)
         discard_wrench(s["loop"])
         forget_sent(s["coupling"])
+        forget_pulses(s["impact"])
         direct(refresh_energies, s)(s)
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         add_reset_work(s["energy"], after - before)
@@ -413,6 +424,7 @@ class BoundKernel:
         bind_observer(s["observer"], parameters.guarding)
         bind_watch(s["watch"], parameters)
         bind_timing(s["timing"], parameters.device_delay)
+        bind_pulse(s["impact"], parameters)
         bind_shown(s["shown"], parameters)
         is_rigid = parameters.is_rigid and not parameters.scene_ticks and self._meters_scene
         own = replace(parameters, is_rigid=is_rigid)
@@ -479,6 +491,10 @@ class BoundHands:
                 raise HapticBridgeError(
                     "several hands need a method that MuJoCo solves whole, one substep, and a "
                     "scene that steps in every tick"
+                )
+            if each.impact_pulses > 0.0:
+                raise HapticBridgeError(
+                    f"impact_pulses is {each.impact_pulses:g}; it must be 0 with several hands"
                 )
             if (each.period, each.is_rigid) != (parameters[0].period, parameters[0].is_rigid):
                 raise HapticBridgeError("all hands of a scene need one period and one contact")

@@ -74,6 +74,7 @@ from hapticbridge.kernel.handle import (
     take_handle_frames,
     turns_actuators_alone,
 )
+from hapticbridge.kernel.impact_pulse import add_pulse, charge_pulses, earn, note_blows
 from hapticbridge.kernel.jit import compiled, compiled_for_threads
 from hapticbridge.kernel.law import (
     charge_lag,
@@ -255,6 +256,7 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
     if code != OK:
         return code
     ticks = s.guard.consecutive_stale + 1
+    charge_pulses(s, moved, max(elapsed, s.run.period))
     observe_energy(s, moved, turned, interval)
     meter_device(s, moved, turned, interval)
     watch_device(s, moved, turned, interval)
@@ -519,6 +521,8 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
         note_contacts(s)
     force, torque, moved, turned = _evaluate(state, is_last)
     end_mocap_moves(s)
+    if s.impact.is_on or (s.contact.bounces and s.contact.rebound_ratio > 0.0):
+        note_blows(s)
     if s.contact.is_rigid:
         finish_contacts(s)
     work = s.shown.work if scheme == Scheme.SHOWN else dot(force, moved) + dot(torque, turned)
@@ -594,7 +598,7 @@ def _render(s: State, force: Vector, torque: Vector) -> None:
     """Turns the wrench on the tool into the wrench on the device, or takes what it reports.
 
     In this order: scale, axes with a motor, the lever, share of the passivity controller's
-    damping what fits, and the energy limit at full speed.
+    damping what fits, the energy limit at full speed, and the pulse of a blow.
     """
     run = s.run
     if run.is_apart:
@@ -615,6 +619,7 @@ def _render(s: State, force: Vector, torque: Vector) -> None:
         force, torque = scaled(lever, force), scaled(lever, torque)
     force, torque = send_within(s, (force, torque), control(s, force, torque))
     force, torque = within_energy_limit(s, force, torque)
+    force = add_pulse(s, force)
     store_vector(s.loop.wrench_on_device[0:3], force)
     store_vector(s.loop.wrench_on_device[3:6], torque)
     note_sent(s)
@@ -653,7 +658,7 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
         return refuse_tick(state, BAD_RESULT)
     for i in range(state.size):
         observe_release(state[i])
-    fill_tank(s)
+    fill_tank(s, earn(s))
     if has_positions and not is_sound(s):
         loop.has_positions = 0
     for i in range(state.size):
@@ -725,6 +730,11 @@ def _record(s: State, r: State) -> None:
     r.lever = s.guard.lever
     r.contact_tank = s.contact.tank
     r.scene_step, r.scene_tank = s.shown.scene_step, s.shown.tank
+    blow = s.impact
+    store_vector(r.pulse, vector_of(blow.newest))
+    r.pulse_account, r.blow_energy = blow.account, blow.blow_energy
+    r.blow_speed, r.blow_rebound = blow.blow_speed, blow.blow_rebound
+    r.blow_restitution = blow.blow_restitution
 
 
 @compiled

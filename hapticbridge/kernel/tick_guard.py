@@ -215,13 +215,13 @@ def send_within(
     """
     run = s.run
     return (
-        _within(wrench[0], damped[0], run.force_limit),
-        _within(wrench[1], damped[1], run.torque_limit),
+        within_limit(wrench[0], damped[0], run.force_limit),
+        within_limit(wrench[1], damped[1], run.torque_limit),
     )
 
 
 @compiled
-def _within(base: Vector, whole: Vector, limit: float) -> Vector:
+def within_limit(base: Vector, whole: Vector, limit: float) -> Vector:
     """Returns base + β (whole − base) with the largest β <= 1 that keeps the norm."""
     if dot(whole, whole) <= limit * limit:
         return whole

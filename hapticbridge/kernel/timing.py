@@ -32,7 +32,8 @@ No property of the law is assumed: force level, slip, lever, changed gains, cont
 and slower scenes are all in W_c and V. From any sample on, the hand gets at most A + C + q V, and
 what the scene had or created. In a strict scene with b >= N and constant times, A stays near 0; see
 ``theory.bounds.minimum_damping``. What a scene within its slack created is added to A for a
-device that answers late: only the condition of a device in time pays for it.
+device that answers late: only the condition of a device in time pays for it. Pulses of blows, and
+the damping b_s on which they count, are left out: they have an account (``kernel.impact_pulse``).
 
 References:
     Brown & Colgate 1997, eq. (6); the account is its proof in the time domain.
@@ -127,13 +128,22 @@ def _advance(timing: Part, end: int) -> None:
 
 
 @compiled
+def _of_coupling(s: State, i: int) -> float:
+    """Returns component i of the wrench on the device without the pulse, which has an account."""
+    whole = s.loop.wrench_on_device[i]
+    return float(whole - s.impact.newest[i]) if i < 3 else float(whole)
+
+
+@compiled
 def _energy(s: State, time: float, is_late: bool) -> float:
     """Returns E_k + u'_k·δp_k for a time τ in s."""
-    t, w, u, work = s.timing, s.loop.wrench_on_device, s.loop.unfelt, 0.0
+    t, u, work = s.timing, s.loop.unfelt, 0.0
     for i in range(6):
-        b = s.observer.assumed_damping if i < 3 else s.observer.assumed_rotational_damping
+        b = s.observer.assumed_rotational_damping
+        if i < 3:
+            b = s.observer.assumed_damping - s.impact.spare
         mean, d = t.impulse[i] / time, t.moved[i]
-        middle = mean if is_late else t.lever * w[i]
+        middle = mean if is_late else t.lever * _of_coupling(s, i)
         work += (middle + t.lever * u[i]) * d
         if is_late:
             work -= b * d * d / time
@@ -165,7 +175,7 @@ def keep_account(s: State, deadline_ns: int, read_ns: int, write_ns: int) -> Non
         read_ns: When its sample was read.
         write_ns: When its wrench was sent.
     """
-    t, lateness, w = s.timing, 1e-9 * (read_ns - deadline_ns), s.loop.wrench_on_device
+    t, lateness = s.timing, 1e-9 * (read_ns - deadline_ns)
     t.delays += 1e-9 * (write_ns - read_ns)
     t.jitter += max(lateness - t.lateness, 0.0)
     t.lateness = lateness
@@ -192,5 +202,5 @@ def keep_account(s: State, deadline_ns: int, read_ns: int, write_ns: int) -> Non
         t.arrivals[t.newest % RING] = write_ns + t.device_delay_ns
         for i in range(6):
             t.impulse[i] = t.square[i] = 0.0
-            t.wrenches[t.newest % RING][i] = w[i]
+            t.wrenches[t.newest % RING][i] = _of_coupling(s, i)
     t.max_uncovered = max(t.max_uncovered, t.uncovered + created)

@@ -189,3 +189,68 @@ class Evidence:
             allowed=energies[1],
             excess=energies[2],
         )
+
+
+# Blows of the tool
+
+
+@dataclass(frozen=True, slots=True)
+class Blow:
+    """One blow of the tool: ticks in a row in which a contact of it closes fast.
+
+    Attributes:
+        time: Due time of its first tick in s.
+        tick: Number of this tick.
+        speed: Normal speed of the contact in m/s, of the largest if there are several.
+        asked: Coefficient of restitution e that the contact asks for.
+        had: e that it had.
+        burned: Energy W in J that it took from the bodies.
+        paid: Energy in J at the hand that it paid into the account of pulses.
+        worked: Work Σ p·δp in J of the pulses until the next blow; negative if the hand did it.
+    """
+
+    time: float
+    tick: int
+    speed: float
+    asked: float
+    had: float
+    burned: float
+    paid: float
+    worked: float
+
+    @property
+    def returned(self) -> float:
+        """Energy in J that it gave back, as one contact with its e does: W e²/(1 − e²)."""
+        return self.burned * self.had**2 / max(1.0 - self.had**2, 1e-9)
+
+
+def blows_of(evidence: Evidence) -> list[Blow]:
+    """Returns the blows of the tool in order."""
+    ticks, parameters = evidence.ticks, evidence.parameters
+    struck = np.flatnonzero(ticks["blow_energy"] > 0.0)
+    if not struck.size:
+        return []
+    groups = np.split(struck, np.flatnonzero(np.diff(struck) > 1) + 1)
+    ratio = parameters.impact_pulses * parameters.force_scale / parameters.scale
+    spent = np.maximum(-np.diff(evidence.created, prepend=0.0), 0.0)
+    paid = ratio * np.minimum(ticks["blow_energy"], spent)
+    moved = np.diff(ticks["device_position"], axis=0, append=ticks["device_position"][-1:])
+    work = np.sum(ticks["pulse"] * moved, axis=1)
+    ends = [group[0] + 1 for group in groups[1:]] + [len(ticks)]
+    found = []
+    for group, end in zip(groups, ends, strict=True):
+        rows, last = ticks[group], ticks[group[-1]]
+        speed = float(rows["blow_speed"][0])
+        found.append(
+            Blow(
+                time=float(evidence.time[group[0]]),
+                tick=int(rows["tick"][0]),
+                speed=speed,
+                asked=float(rows["blow_restitution"].max()),
+                had=float(last["blow_rebound"] * last["blow_speed"]) / speed,
+                burned=float(rows["blow_energy"].sum()),
+                paid=float(paid[group].sum()),
+                worked=float(work[group[0] + 1 : end].sum()),
+            )
+        )
+    return found

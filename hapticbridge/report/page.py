@@ -23,7 +23,7 @@ from hapticbridge.plotting import inline_svg
 from hapticbridge.recording import Recording
 from hapticbridge.recording.format import SHOWN_EVENT
 from hapticbridge.report.cause import excess_of, pump_behind_trip
-from hapticbridge.report.evidence import Evidence
+from hapticbridge.report.evidence import Blow, Evidence, blows_of
 from hapticbridge.report.plots import (
     activities,
     draw_energies,
@@ -33,7 +33,7 @@ from hapticbridge.report.plots import (
     draw_timing,
 )
 from hapticbridge.run.description import meta_float
-from hapticbridge.units import energy_rows, format_share, format_si, format_wrenches
+from hapticbridge.units import energy_rows, format_energy, format_share, format_si, format_wrenches
 
 # Facts of the run
 
@@ -41,6 +41,9 @@ Facts = list[tuple[str, str]]
 
 MAX_EVENTS = 200
 """Largest number of events on a page."""
+
+MAX_BLOWS = 50
+"""Largest number of blows on a page. More would make the page long, and look alike."""
 
 MAX_INPUTS = 10
 """Largest number of inputs and reports among them. A run with scripted inputs has one per tick,
@@ -223,6 +226,18 @@ def _controller_words(evidence: Evidence) -> str:
     amounts = [f"{damping:.3g} {unit}" for unit, damping in most.items() if damping]
     injected = f", up to {' and '.join(amounts)} injected" if amounts else ""
     return f"{name}, at work in {percent(active)} of the ticks{injected}"
+
+
+def blow_row(blow: Blow) -> tuple[str, ...]:
+    """Returns time, speed, e, energies and work of a blow, in words."""
+    energies = (blow.burned, blow.returned, blow.paid, blow.worked)
+    return (
+        f"{blow.time:.3f} s",
+        format_si(blow.speed, "m/s"),
+        f"{blow.asked:.2f}",
+        f"{blow.had:.2f}",
+        *(format_energy(energy) for energy in energies),
+    )
 
 
 def balance_of(report: AuditReport) -> str:
@@ -446,7 +461,7 @@ def _evidence_parts(
 ) -> dict[str, Any]:
     evidence = hands[0]
     lateness = evidence.lateness
-    is_timed = bool(lateness.any())
+    is_timed, blows = bool(lateness.any()), blows_of(evidence)
     return {
         "head": head_facts(report, evidence),
         "hands": [
@@ -459,6 +474,8 @@ def _evidence_parts(
         ],
         "timing": inline_svg(draw_timing(evidence)),
         "balance": balance_of(report),
+        "blows": [blow_row(each) for each in blows[:MAX_BLOWS]],
+        "more_blows": max(len(blows) - MAX_BLOWS, 0),
         "moment": moment_of(evidence, report, in_process=in_process),
         "lateness": [float(np.percentile(lateness, p)) for p in (50, 99, 100)] if is_timed else [],
         "shares": [(name, percent(on)) for name, on in activities(evidence) if on.any()],

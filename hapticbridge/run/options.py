@@ -46,6 +46,7 @@ from hapticbridge.errors import (
     HapticBridgeError,
     RecordingError,
     SceneError,
+    choices,
 )
 from hapticbridge.kernel.parameters import (
     MAX_BUTTONS,
@@ -178,6 +179,11 @@ class BridgeOptions:
             real device.
         tool_weight: Weight of the tool in the hand, unless the device cannot hold it. With
             --no-tool-weight, or False, the bridge carries it.
+        impact_pulses: Share of the energy that a blow of the tool burns, 0 to 1, which may pay for
+            a short pulse of force on the device: a tap then feels crisp. It needs rigid contact.
+            Damping of the device beyond what the coupling needs makes it stronger.
+        pulse: Pulse of a blow: 'steel', 'wood' or 'rubber', or HZ,MS for its frequency in Hz and
+            the time in ms in which it falls to 37 %.
         realtime: Request real-time priority and locked memory for the loop, and print what the
             system refuses (see 'hapticbridge doctor'). By default requested for a real device.
         pipelined: Compute ahead, after the wrench was sent, what needs no new sample. The numbers
@@ -205,6 +211,8 @@ class BridgeOptions:
     mark: int | None = _button()
     probe: bool | None = None
     tool_weight: bool = True
+    impact_pulses: float = option(0.0, least=0.0, most=1.0)
+    pulse: str = option("wood")
     realtime: bool | None = None
     pipelined: bool | None = None
     live: bool = option(False, no_flag="a run of the command line shows it on a terminal")
@@ -214,6 +222,7 @@ class BridgeOptions:
         if self.scene_ticks:
             self.rendering_method.refuse_slow()
         refuse_substeps(self.rendering_method.scheme, self.substeps or 1)
+        pulse_of(self.pulse)
         if self.clutch is not None and self.clutch == self.dead_man:
             raise DeviceError(
                 f"clutch and dead-man are both button {self.clutch}; they exclude each other"
@@ -269,6 +278,31 @@ class BridgeOptions:
         else:
             method = method_named(self.method)
         return method.with_contact(self.contact)
+
+
+PULSES = {"steel": (300.0, 0.011), "wood": (100.0, 0.0125), "rubber": (30.0, 0.0167)}
+"""Frequency in Hz and time constant in s of the pulse of a blow on a material. They are those of
+taps on aluminium, wood and rubber (Okamura, Cutkosky & Dennerlein 2001), rounded; steel rings as
+aluminium does, beyond what a hand tells apart. Others feel like another material."""
+
+
+def pulse_of(text: str) -> tuple[float, float]:
+    """Returns frequency in Hz and time constant in s of a name of ``PULSES`` or of ``HZ,MS``.
+
+    Raises:
+        HapticBridgeError: It is neither.
+    """
+    if text in PULSES:
+        return PULSES[text]
+    try:
+        frequency, decay = (float(part) for part in text.split(","))
+    except ValueError:
+        frequency = decay = math.nan
+    if not (0.0 <= frequency < math.inf and 0.0 < decay < math.inf):
+        raise HapticBridgeError(
+            f"pulse is {shown(text)}; it must be one of {choices(PULSES)}, or HZ,MS such as 250,8"
+        )
+    return frequency, 1e-3 * decay
 
 
 DEFAULT_OPTIONS = BridgeOptions()
@@ -431,6 +465,8 @@ class RunSetup(StepTimes):
         mark: Bit of the mark button; 0 without one.
         is_probed: True if the device is probed before the run.
         tool_weight: False to carry the tool's weight.
+        impact_pulses: Share of a blow's energy that may pay for a pulse.
+        pulse: Frequency in Hz and time constant in s of the pulses.
         is_realtime: True if real time is requested from the system.
         is_pipelined: True if a tick computes ahead for the next one.
     """
@@ -449,6 +485,8 @@ class RunSetup(StepTimes):
     mark: int = 0
     is_probed: bool = False
     tool_weight: bool = True
+    impact_pulses: float = 0.0
+    pulse: tuple[float, float] = PULSES["wood"]
     is_realtime: bool = False
     is_pipelined: bool = False
 
@@ -515,6 +553,8 @@ class RunSetup(StepTimes):
             is_probed=not info.is_prescribed
             and (info.is_real if options.probe is None else options.probe),
             tool_weight=options.tool_weight,
+            impact_pulses=options.impact_pulses,
+            pulse=pulse_of(options.pulse),
             is_realtime=wants_real_time(options.realtime, clock, is_real=info.is_real),
             is_pipelined=is_real_clock if options.pipelined is None else options.pipelined,
         )
@@ -573,6 +613,12 @@ class RunSetup(StepTimes):
     def coupling_limits(self) -> CouplingLimits:
         """Couplings that may be selected during the run."""
         return CouplingLimits(loop=self.loop, start=self.attainable, limits=self.limits)
+
+    @property
+    def pulse_damping(self) -> float:
+        """Damping in N s/m that the device has for pulses, beyond what the coupling needs."""
+        own, _ = self.info.dissipating_damping
+        return max((own or 0.0) - self.loop.needs()[0], 0.0) if self.impact_pulses else 0.0
 
     def holding(self, start: NDArray[np.void], effective: Coupling | None) -> RunParameters:
         """Returns the parameters of a run that starts now and whose device can hold the tool.
@@ -684,6 +730,10 @@ class RunSetup(StepTimes):
             device_rotational_damping=rotational_damping,
             guarding=self.guard,
             loop_period=self.info.loop_period or 0.0,
+            impact_pulses=self.impact_pulses,
+            pulse_frequency=self.pulse[0],
+            pulse_decay=self.pulse[1],
+            pulse_damping=self.pulse_damping,
         )
 
     def _loaded(self, parameters: RunParameters) -> RunParameters:

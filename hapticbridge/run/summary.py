@@ -29,7 +29,7 @@ from hapticbridge.demand.timekeeping import RunTimes, Timekeeping
 from hapticbridge.demand.trip import Trip
 from hapticbridge.device import DeviceInfo
 from hapticbridge.kernel.codes import Grip, Scheme, coupling_ids, held_body
-from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
+from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy, work_words
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import TickFlag
@@ -254,6 +254,7 @@ class Summary:
         credit: Energy in J that another program's scene may give to the hand; 0 for another scene.
         grip: Name of the grip that the hand holds.
         device: Name of the device.
+        pulses: Energy in J that blows paid for pulses, and work in J of the pulses; None without.
         trip: Stop by the guard; None without one.
         probe: Result of the probe of the device before the run, as a clause; empty without one.
         hands: Summary of each hand by itself, if several hold the scene. Fault, share of the slack
@@ -288,6 +289,7 @@ class Summary:
     credit: float = 0.0
     grip: str = ""
     device: str = ""
+    pulses: tuple[float, float] | None = None
     trip: Trip | None = None
     probe: str = ""
     hands: tuple[Summary, ...] = ()
@@ -436,6 +438,9 @@ class Summary:
         if Grip.from_text(self.grip).is_joint:
             peak = f"{format_si(self.peak_force, 'N')} on the fingers"
         yield "peak", peak + reached
+        if self.pulses is not None:
+            paid, worked = self.pulses
+            yield "pulses", f"paid {format_energy(paid)} by blows; they {work_words(worked)}"
         if self.reach is not None:
             yield "reach", f"{format_si(self.reach, 'm')}; beyond, no handle and no force"
         for name, text in energy_rows(self.energies, self.start_potential, self.credit):
@@ -569,6 +574,9 @@ class Summary:
             probe=outcome.probed.words if outcome.probed else "",
             grip=parameters.grip,
             device=info.name,
+            pulses=(float(state["impact"]["earned"][0]), float(state["impact"]["work"][0]))
+            if parameters.impact_pulses
+            else None,
         )
 
 

@@ -1,0 +1,333 @@
+"""Blows of the tool, and a decaying pulse of force on the device that they pay for.
+
+A tap on a wall of 1 to 2 kN/m feels soft, because its force rises slowly. From the tick after a
+blow on, the device gets beside the coupling's wrench the force in N
+
+    p_j = A r exp(−j T/τ) cos(2π f j T) n,    j = 0, 1, 2, …
+
+with the frequency f in Hz, the time constant τ in s, the lever r and the blow's normal n, away from
+what the tool struck. The scene does not get it. A *blow* is a contact of the tool with a force and
+a normal velocity v_n beyond ``BLOW_SPEED`` at the start of the step, v⁺ at its end in m/s. Its
+normal impulse P in N s takes from the bodies
+
+    W = −P (v_n + v⁺)/2
+
+in J. The account B of the pulses gets q σ min(W, −E_k) in a tick, with q = force_scale / scale, the
+share σ of ``impact_pulses`` and the energy E_k that the environment created. This is taken from the
+tank of rigid contacts, so that no energy is spent twice. Each pulse pays for its work p·δp on the
+device. Within a time t the hand moves the device by δp <= v t, v being the guard's largest speed,
+and the device's damping beyond what the coupling needs, b_s in N s/m, burns at least b_s ‖δp‖²/t.
+So a pulse gives, beyond that, at most
+
+    R(p, t) = max_u (‖p‖ − b_s u) u t,    0 <= u <= v.
+
+It is charged p·δp, but no more than R; motion without a sample is charged R. A device may hold the
+force of one of the last d ticks, so that the largest of their charges counts. A pulse is sent only
+as large as B covers all charges to come, Σ_i max_{m <= d−i} R(p_{k−m}, T) <= B. What no charge
+needs falls with exp(−t/τ), so that one hard blow makes no later tap hard. Hence for any hand, with
+b >= b_s + (what the coupling needs),
+
+    Σ p·δp − Σ b_s ‖δp‖²/t <= q σ Σ min(W, −E_k),
+
+and the total out of both ports is at most what the hand put in, the scene's storage and the springs
+at the start. A pulse follows no motion, so it does not enter the condition of the coupling: the
+loop is as stable as without, and the hand gets a bounded energy. If a tick takes longer than T, R
+may exceed what was kept; the coupling's springs owe the excess (``law.owe``).
+
+There is no pulse while a sample is missing, the passivity controller or the watch acts, or the
+lever is 0. Force and pulse together keep the force limit; the pulse yields.
+
+References:
+    Okamura, Cutkosky & Dennerlein 2001, IEEE/ASME Trans. Mechatronics 6 (the decaying sinusoid);
+    Kuchenbecker, Fiene & Niemeyer 2006, IEEE TVCG 12 (transients of contact).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hapticbridge.kernel.codes import (
+    CONTROLLER_ACTIVE,
+    PROBED,
+    RUNS_AWAY,
+    STALE_SAMPLE,
+    SWINGING,
+    Part,
+    State,
+)
+from hapticbridge.kernel.handle import device_from_scene
+from hapticbridge.kernel.jit import compiled
+from hapticbridge.kernel.law import SENT, felt, owe
+from hapticbridge.kernel.ledger import opened_by_mocap
+from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
+from hapticbridge.kernel.parameters import RunParameters, whole_ticks
+from hapticbridge.kernel.passivity_controller import largest_power
+from hapticbridge.kernel.pose import (
+    Vector,
+    add,
+    dot,
+    norm,
+    scaled,
+    store_vector,
+    subtract,
+    vector_of,
+)
+from hapticbridge.kernel.restitution import BLOW_SPEED
+from hapticbridge.kernel.rigid_contact import MAX_ROWS, note_ends
+from hapticbridge.kernel.tick_guard import within_limit
+
+FASTEST = 10.0
+"""Largest speed in m/s of a device whose guard has no limit of speed. No arm is faster; a larger
+value makes pulses weaker where no damping is spare."""
+
+FORGOTTEN = 1e-12
+"""Energy in J of the account that is dropped. It is less than rounding."""
+
+FADED = 0.01
+"""Share of its first force below which a pulse ends; no unit."""
+
+_CAUTION = SWINGING | RUNS_AWAY | PROBED
+
+IMPACT_DTYPE = np.dtype(
+    [
+        ("is_on", "<i8"),
+        ("late_ticks", "<i8"),
+        ("age", "<i8"),
+        ("flight", "<i8"),
+        ("share", "<f8"),
+        ("angle", "<f8"),
+        ("rate", "<f8"),
+        ("forgets", "<f8"),
+        ("spare", "<f8"),
+        ("speed", "<f8"),
+        ("account", "<f8"),
+        ("earned", "<f8"),
+        ("work", "<f8"),
+        ("amplitude", "<f8"),
+        ("blow_energy", "<f8"),
+        ("largest_blow", "<f8"),
+        ("blow_speed", "<f8"),
+        ("blow_restitution", "<f8"),
+        ("blow_rebound", "<f8"),
+        ("direction", "<f8", 3),
+        ("normal", "<f8", 3),
+        ("newest", "<f8", 3),
+        ("sent", "<f8", (SENT, 3)),
+    ]
+)
+"""Sub-record ``impact``, written by this module alone. ``share`` is σ, ``angle`` 2π f T in rad,
+``rate`` T/τ, ``forgets`` 1 − exp(−T/τ), ``spare`` b_s in N s/m, ``speed`` v in m/s and
+``late_ticks`` d. ``age`` is j, −1 without a pulse, ``flight`` the ticks in which pulses may still
+act. ``account`` is B in J, ``earned`` all that it got, ``work`` Σ p·δp; ``amplitude`` A in N,
+``direction`` n in the device's frame, ``newest`` the pulse of this tick and ``sent`` those of the
+last ticks in N. ``blow_energy`` is the W of all blows of the tick, ``normal`` the sum of their
+normals times W in the scene's frame; of the largest blow W, the speed −v_n in m/s, the coefficient
+of restitution that its contact asks for, and v⁺/(−v_n)."""
+
+
+def bind_pulse(impact: Part, parameters: RunParameters) -> None:
+    """Fills in the sub-record; without ``impact_pulses`` it notes blows alone."""
+    period = parameters.period
+    impact["is_on"] = parameters.impact_pulses > 0.0
+    impact["share"] = parameters.impact_pulses
+    impact["angle"] = 2.0 * math.pi * parameters.pulse_frequency * period
+    impact["rate"] = period / parameters.pulse_decay
+    impact["forgets"] = -math.expm1(-period / parameters.pulse_decay)
+    impact["spare"] = parameters.pulse_damping
+    impact["speed"] = min(parameters.guarding.speed, FASTEST)
+    late = whole_ticks(parameters.guarding.stated_delay, period)
+    impact["late_ticks"] = min(late, SENT - 2)
+    impact["age"] = -1
+
+
+def forget_pulses(impact: Part) -> None:
+    """Ends the pulse, after a pause or reset in which no force was sent."""
+    impact["sent"] = impact["newest"] = 0.0
+    impact["age"], impact["flight"] = -1, 0
+
+
+def forgo_spare_damping(impact: Part) -> None:
+    """Counts no spare damping from now on, because the coupling changes and may need it."""
+    impact["spare"] = 0.0
+
+
+# Blows
+
+
+@compiled
+def note_blows(s: State) -> None:
+    """Adds the tool's blows of the MuJoCo step that just ended; needs its rows."""
+    mj, h, impact = s.mj, s.run.timestep, s.impact
+    count = ints(mj.nefc, 1)[0]
+    if count > MAX_ROWS or mj.geom_is_tool == 0:
+        return
+    note_ends(s)
+    ends, force = floats(s.contact.end_velocity, count), floats(pointer_at(mj.efc_force), count)
+    velocities, rebounds = floats(pointer_at(mj.efc_vel), count), floats(s.contact.rebounds, count)
+    is_tool, contacts = ints(mj.geom_is_tool, mj.ngeom), pointer_at(mj.contact)
+    for c in range(ints(mj.ncon, 1)[0]):
+        one = contacts + c * mj.contact_size
+        row, geoms = ints(one + mj.contact_row, 1)[0], ints(one + mj.contact_geoms, 2)
+        if row < 0 or force[row] <= 0.0 or min(geoms[0], geoms[1]) < 0:
+            continue
+        moved = opened_by_mocap(s, one) / h if s.energy.mocap_has_moved else 0.0
+        speed, end = velocities[row] + moved, ends[row] + moved
+        energy = -0.5 * h * force[row] * (speed + end)
+        side = is_tool[geoms[1]] - is_tool[geoms[0]]  # the normal points to the second geom
+        if speed > -BLOW_SPEED or side == 0 or energy <= 0.0:
+            continue
+        impact.blow_energy += energy
+        normal = vector_of(floats(one + mj.contact_frame, 3))
+        store_vector(impact.normal, add(vector_of(impact.normal), scaled(side * energy, normal)))
+        if energy > impact.largest_blow:
+            impact.largest_blow, impact.blow_speed = energy, -speed
+            impact.blow_restitution = -rebounds[row] / speed if s.contact.bounces else 0.0
+            impact.blow_rebound = max(-end / speed, 0.0)
+
+
+@compiled
+def forget_blows(impact: Part) -> None:
+    """Forgets the blows of the tick before."""
+    impact.blow_energy = impact.largest_blow = 0.0
+    impact.blow_speed = impact.blow_restitution = impact.blow_rebound = 0.0
+    impact.normal[0] = impact.normal[1] = impact.normal[2] = 0.0
+
+
+@compiled
+def earn(s: State) -> float:
+    """Pays a share of the tick's blows into the account, and starts their pulse.
+
+    Needs the balance of the tick, before the tank of rigid contacts is filled.
+
+    Returns:
+        Energy in J of the scene that the tank does not get.
+    """
+    impact = s.impact
+    if impact.blow_energy <= 0.0 or not impact.is_on:
+        return 0.0
+    burned = max(s.contact.last_energy - s.energy.environment_energy, 0.0)
+    energy = impact.share * min(impact.blow_energy, burned)
+    normal = vector_of(impact.normal)
+    size = norm(normal)
+    if energy <= 0.0 or size == 0.0:
+        return 0.0
+    at_hand = s.run.force_scale / s.run.scale * energy
+    impact.account += at_hand
+    impact.earned += at_hand
+    impact.age = 0
+    store_vector(impact.direction, device_from_scene(s.run.axes, scaled(1.0 / size, normal)))
+    return float(energy)
+
+
+# The account
+
+
+@compiled
+def _most(impact: Part, size: float) -> float:
+    """Returns R(p, 1 s) of a pulse in J, for its size in N."""
+    if size == 0.0:
+        return 0.0
+    return largest_power(size, impact.spare, impact.speed)
+
+
+@compiled
+def _sent(impact: Part, tick: int) -> Vector:
+    return vector_of(impact.sent[tick % SENT])
+
+
+@compiled
+def charge_pulses(s: State, moved: Vector, elapsed: float) -> None:
+    """Charges the account with the pulses that the device held until this sample.
+
+    Args:
+        s: The bound state, before the sample counts.
+        moved: Motion of the device in m since the last tick.
+        elapsed: Time in s since then, at least T.
+    """
+    impact, tick = s.impact, s.loop.tick
+    if impact.blow_energy > 0.0:
+        forget_blows(impact)
+    if impact.account == 0.0 and impact.flight == 0:
+        return
+    impact.flight = max(impact.flight - 1, 0)
+    is_known = not s.loop.external_flags & STALE_SAMPLE and s.guard.time_since_sample == 0.0
+    charge = -np.inf
+    for j in range(impact.late_ticks + 1):
+        sent = _sent(impact, tick - 1 - j)
+        most = elapsed * _most(impact, norm(sent))
+        charge = max(charge, min(dot(sent, moved), most) if is_known else most)
+    impact.work += dot(_sent(impact, tick - 1), moved)
+    impact.account -= charge
+    if impact.account < 0.0:
+        owe(s, -impact.account * s.run.scale / s.run.force_scale)
+        impact.account = 0.0
+    free = impact.account - _to_come(s)
+    if free > 0.0:
+        impact.account -= free * impact.forgets if free > FORGOTTEN else free
+
+
+@compiled
+def _to_come(s: State) -> float:
+    """Returns the most that the pulses on their way will be charged in J, without that of now.
+
+    In the tick of number i from now on that is R of the largest pulse that may still act then.
+    """
+    impact, largest, total = s.impact, 0.0, 0.0
+    for m in range(1, impact.late_ticks + 1):
+        largest = max(largest, s.run.period * _most(impact, norm(_sent(impact, s.loop.tick - m))))
+        total += largest
+    return float(total)
+
+
+@compiled
+def _affordable(s: State) -> float:
+    """Returns the R(p, T) in J that the account covers beside the charges to come.
+
+    A pulse raises the smallest of these charges first.
+    """
+    impact, left, largest = s.impact, s.impact.account - _to_come(s), 0.0
+    for m in range(1, impact.late_ticks + 1):
+        largest = max(largest, s.run.period * _most(impact, norm(_sent(impact, s.loop.tick - m))))
+        if left <= m * largest:
+            return float(left / m)
+        left += largest
+    return float(left / (impact.late_ticks + 1))
+
+
+@compiled
+def _largest_force(impact: Part, power: float) -> float:
+    """Returns the largest force in N with R(p, 1 s) up to a power in W."""
+    force = 2.0 * math.sqrt(impact.spare * power)
+    if impact.spare > 0.0 and force <= 2.0 * impact.spare * impact.speed:
+        return force
+    return float(power / impact.speed + impact.spare * impact.speed)
+
+
+@compiled
+def add_pulse(s: State, force: Vector) -> Vector:
+    """Returns the force on the device in N with the pulse of this tick, and notes the pulse."""
+    impact, tick = s.impact, s.loop.tick
+    if not impact.is_on:
+        return force
+    sent = (0.0, 0.0, 0.0)
+    is_held = s.loop.external_flags & STALE_SAMPLE or s.guard.lever == 0.0
+    if is_held or s.observer.flags & CONTROLLER_ACTIVE or s.watch.flags & _CAUTION:
+        impact.age = -1
+    if impact.age >= 0:
+        most = _largest_force(impact, max(_affordable(s), 0.0) / s.run.period)
+        if impact.age == 0:
+            impact.amplitude = most
+        envelope = math.exp(-impact.rate * impact.age)
+        size = impact.amplitude * envelope * math.cos(impact.angle * impact.age) * s.guard.lever
+        wanted, _ = felt(s, scaled(min(max(size, -most), most), vector_of(impact.direction)), sent)
+        whole = within_limit(force, add(force, wanted), s.run.force_limit)
+        sent = subtract(whole, force)
+        force = whole
+        impact.age = impact.age + 1 if envelope > FADED else -1
+    if sent != (0.0, 0.0, 0.0):
+        impact.flight = impact.late_ticks + 1
+    store_vector(impact.newest, sent)
+    store_vector(impact.sent[tick % SENT], sent)
+    return force
