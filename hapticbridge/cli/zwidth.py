@@ -14,7 +14,7 @@ from hapticbridge.arguments import Arguments, option, shared
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress, write_figure
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
-from hapticbridge.demand.certificate import DampingCondition, conditions_of
+from hapticbridge.demand.certificate import IF_AT_ONCE, DampingCondition, conditions_of
 from hapticbridge.demand.loop_setting import IN_TIME, Lag, LoopSetting, delay_ticks, pulling_loop
 from hapticbridge.demand.methods import RunCoupling, default_method
 from hapticbridge.demand.plots import (
@@ -470,8 +470,9 @@ class Bound:
             out.print(f"device damping {b:g} >= {needed:g} N s/m: passive in any hand{limit}")
             if has_steps:
                 return
+            at_once = f"{IF_AT_ONCE}, " if condition is not None and condition.clause else ""
             out.print(
-                f"method {method.name} needs the larger of KT/2 and B: any K up to "
+                f"{at_once}method {method.name} needs the larger of KT/2 and B: any K up to "
                 f"{2 * b / period:g} N/m beside any B up to {b:g} N s/m"
             )
             command = next_command(self.stiffness, max(self.damping, least), self.rate)
