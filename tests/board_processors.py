@@ -13,7 +13,7 @@ from firmware_build import COMPILER, FIRMWARE
 
 HERE = Path(__file__).parent
 
-MOST = {"lines": 2500, "poses": 10_000}
+MOST = {"lines": 2500, "poses": 10_500}
 """Instructions of a period with three axes and with six, of the 15 000 that 10 kHz leaves at
 150 MHz."""
 

@@ -25,8 +25,10 @@
 //
 // An HbPoseLoop has such a coupling of rotations beside it, with e the rotation vector from the
 // tool to the handle and dh, dy those of their motions; planes stop the tool's motion along lines
-// alone. A rotation's V is convex up to half a turn. Near and beyond it P is the least of f . dy and
-// what the spring and its damper give.
+// alone. A force that comes late counts on a spring that gives |df|^2 / 2K more than its work when
+// the tool moves, as it does along lines. About a large twist it gives less, so P is the least of
+// f . dy and V's fall - |df|^2 / 2K with what the damper gives. Where a twist passes half a turn the
+// torque reverses at once, and no damping bears that: at 2.5 rad the tool turns with the handle.
 //
 // A loop belongs to one interrupt. What a main loop receives for it is copied with interrupts off.
 //
@@ -117,8 +119,12 @@ struct HbReport {
   float torque[3];     // on the device in N m
 };
 
-// Sum of the squares of two angles in rad up to which their sum is at most half a turn, pi^2/2.
-static const float HB_CONVEX = 4.9348f;
+// Sum of the squares of the twist and the tool's turn in rad up to which a spring of rotation is like
+// one along lines: what half a radian lacks is 1 % of what a late force counts on.
+static const float HB_FLAT = 0.25f;
+
+// Largest twist in rad between the shown tool and the handle.
+static const float HB_LARGEST_TWIST = 2.5f;
 
 // How well the timer keeps the period.
 struct HbPace {
@@ -269,9 +275,9 @@ class HbLoopOf {
   const HbReport& report() const { return report_; }
 
  private:
-  // Way of the tool to y*, the rotation there, and the rotation's V in J before.
+  // Way of the tool to y*, the rotation there, and the rotation's V in J and its torque before.
   struct Goal {
-    float step[3], turn[3], rotation[4], held;
+    float step[3], turn[3], rotation[4], held, elastic[3];
   };
 
   // Motion of the tool as it is rounded, and what the coupling gives to it: f in N, torque in N m.
@@ -420,6 +426,8 @@ class HbLoopOf {
       float twist[3];
       hb_turn(report_.tool_turn, report_.rotation, twist);
       goal.held = energy(turn_gains_, sqrtf(dot(twist, twist)));
+      for (int i = 0; i < 3; i++) goal.elastic[i] = turn_gains_.stiffness * twist[i];
+      limit(goal.elastic, turn_gains_.level);
       hb_turn(report_.tool_turn, goal.rotation, goal.turn);
     }
   }
@@ -465,9 +473,20 @@ class HbLoopOf {
       for (int i = 0; i < 3; i++) turn[i] = share * goal.turn[i];
       hb_turned(turn, report_.tool_turn, motion.rotation);
     }
-    hb_turn(report_.tool_turn, motion.rotation, motion.turned);
     float twist[3], elastic[3];
     hb_turn(motion.rotation, report_.rotation, twist);
+    float angle = sqrtf(dot(twist, twist));
+    if (angle > HB_LARGEST_TWIST) {
+      const float kept = HB_LARGEST_TWIST / angle;
+      float slip[3];
+      for (int i = 0; i < 3; i++) {
+        slip[i] = (1.0f - kept) * twist[i];
+        twist[i] *= kept;
+      }
+      hb_turned(slip, motion.rotation, motion.rotation);
+      angle = HB_LARGEST_TWIST;
+    }
+    hb_turn(report_.tool_turn, motion.rotation, motion.turned);
     const float damped = turn_gains_.damping * rate_;
     for (int i = 0; i < 3; i++) {
       elastic[i] = turn_gains_.stiffness * twist[i];
@@ -475,12 +494,14 @@ class HbLoopOf {
     }
     limit(motion.torque, turn_gains_.level);
     const float work = dot(motion.torque, motion.turned);
-    // within half a turn V is convex, and falls by more than the torque's work
-    if (dot(twist, twist) + dot(motion.turned, motion.turned) < HB_CONVEX) return work;
-    float damper[3];
+    if (turn_gains_.stiffness <= 0.0f) return work;
+    if (angle * angle + dot(motion.turned, motion.turned) < HB_FLAT) return work;
+    float damper[3], change[3];
     limit(elastic, turn_gains_.level);
     subtract(motion.torque, elastic, damper);
-    const float fallen = goal.held - energy(turn_gains_, sqrtf(dot(twist, twist)));
+    subtract(goal.elastic, elastic, change);
+    const float lacking = 0.5f * dot(change, change) / turn_gains_.stiffness;
+    const float fallen = goal.held - energy(turn_gains_, angle) - lacking;
     return fminf(work, fallen + dot(damper, motion.turned));
   }
 
