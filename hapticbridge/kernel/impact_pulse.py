@@ -14,10 +14,10 @@ normal impulse P in N s takes from the bodies
 
 in J. The account B of the pulses gets q σ min(W, −E_k) in a tick, with q = force_scale / scale, the
 share σ of ``impact_pulses`` and the energy E_k that the environment created. This is taken from the
-tank of rigid contacts, and counts as created where energy is judged, so that none is spent twice. Each pulse pays for its work p·δp on the
-device. Within a time t the hand moves the device by δp <= v t, v being the guard's largest speed,
-and the device's damping beyond what the coupling needs, b_s in N s/m, burns at least b_s ‖δp‖²/t.
-So a pulse gives, beyond that, at most
+tank of rigid contacts, and counts as created where energy is judged, so that none is spent twice.
+Each pulse pays for its work p·δp on the device. Within a time t the hand moves the device by δp <=
+v t, v being the guard's largest speed, and the device's damping beyond what the coupling needs, b_s
+in N s/m, burns at least b_s ‖δp‖²/t. So a pulse gives, beyond that, at most
 
     R(p, t) = max_u (‖p‖ − b_s u) u t,    0 <= u <= v.
 
@@ -25,10 +25,10 @@ It is charged p·δp, but no more than R; motion without a sample is charged R. 
 force of one of the last d ticks, and change it between two samples. The largest p·δp of these
 pulses counts then, and t Σ_i s_i²/(16 b_s) beside it, with the spread s_i of their components: of
 any motion with the same δp, one that follows the change gets no more. A device that gives no sample
-may hold the last pulse, which is charged until the next sample. A pulse is sent only
-as large as B covers all charges to come, Σ_i max_{m <= d−i} R(p_{k−m}, T) <= B. What no charge
-needs falls with exp(−t/τ), so that one hard blow makes no later tap hard. Hence for any hand, with
-b >= b_s + (what the coupling needs),
+may hold the last pulse, which is charged until the next sample. A pulse is sent only as large as B
+covers all charges to come, Σ_i max_{m <= d−i} R(p_{k−m}, T) <= B. What no charge needs falls with
+exp(−t/τ), so that one hard blow makes no later tap hard. Hence for any hand, with b >= b_s + (what
+the coupling needs),
 
     Σ p·δp − Σ b_s ‖δp‖²/t <= q σ Σ min(W, −E_k),
 
