@@ -129,7 +129,7 @@ def test_a_pause_ends_the_pulse() -> None:
     taps.kernel.resume()
     row = taps.tick(towards(0.0))
     assert row["pulse"][0] == 0.0
-    assert taps.pulse["flight"] == 0
+    assert taps.pulse["held"] == 0.0
 
 
 # The account
@@ -193,6 +193,72 @@ def test_no_hand_gets_more_than_it_put_in(
         + SPARE * np.sum(np.diff(taps.ticks["device_position"][:, 0]) ** 2) / T
     )
     assert taps.kernel.state["observer"]["max_unpaid_energy"][0] <= 1e-9
+
+
+def taken_from_pulses(delay: float, frequency: float, spare: float) -> tuple[float, float]:
+    """Returns the most that a hand got from pulses beyond what blows paid, and all they paid, in J.
+
+    The device changes its force ``delay`` periods after a sample. The hand holds it while no pulse
+    acts, and moves it along each that does, at the speed that gets most.
+    """
+    coupling = replace(COUPLING, stiffness=COUPLING.stiffness / 4)
+    changes = {"guarding": {"stated_delay": delay * T}, "pulse_damping": spare}
+    taps = tapping((0,), coupling, pulse_frequency=frequency, **changes)
+    place = got = most = last = 0.0
+    goal, parts = 0.0235, 20
+    for _ in range(1500):
+        taps.sample["position"][0, 0] = place
+        assert whole_tick(taps.kernel.state, taps.sample, taps.kernel.row, T)
+        newest = float(taps.kernel.row[0]["pulse"][0])
+        for part in range(parts):
+            pulse, v = (last if part < round(delay * parts) else newest), 0.0
+            if pulse:
+                v = (
+                    float(np.clip(pulse / (2 * spare), -9.9, 9.9))
+                    if spare
+                    else 9.9 * np.sign(pulse)
+                )
+            elif not (last or newest):
+                v = float(np.clip((goal - place) / T, -0.3, 0.3))
+            got += (pulse * v - spare * v * v) * T / parts
+            place += v * T / parts
+        if abs(place - goal) < 1e-6:
+            goal = 0.0235 if goal < 0.02 else 0.005
+        last, most = newest, max(most, got - float(taps.pulse["earned"]))
+    return most, float(taps.pulse["earned"])
+
+
+@pytest.mark.parametrize("delay", [0.25, 0.5, 0.75, 1.0])
+@pytest.mark.parametrize("spare", [0.0, 3.0])
+def test_a_hand_that_follows_a_change_of_force_between_samples_gets_no_more(
+    delay: float, spare: float
+) -> None:
+    most, earned = taken_from_pulses(delay, 500.0, spare)
+    assert most <= 1e-9
+    assert earned > 0.1
+
+
+def test_a_device_without_samples_is_charged_for_the_pulse_that_it_holds() -> None:
+    taps = tapping()
+    struck(taps, 0.3, 3)
+    pulse = abs(float(taps.rows[-1]["pulse"][0]))
+    for _ in range(4):
+        taps.tick(towards(0.0), is_stale=True)
+        assert taps.pulse["held"] == pytest.approx(pulse, rel=1e-12)
+    taps.tick(towards(0.0))
+    taps.tick(towards(0.0))
+    assert taps.pulse["held"] == 0.0
+
+
+def test_what_pulses_took_counts_as_created() -> None:
+    taps = tapping()
+    struck(taps, 0.3)
+    s = taps.kernel.state[0]
+    created = float(s["energy"]["environment_energy"])
+    taps.pulse["taken"] = 1.0 - created
+    assert s["energy"]["first_unstrict"] < 0
+    taps.tick(towards(0.0))
+    assert s["energy"]["first_unstrict"] >= 0
 
 
 def test_a_hand_would_get_more_from_pulses_that_nothing_pays_for() -> None:

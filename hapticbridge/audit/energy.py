@@ -252,25 +252,25 @@ class EnergyBalance:
         totals |= _device_energies(block, events, delay)
         in_springs: Array | float = 0.0  # with a delay the device is elsewhere
         is_reset = events.is_reset(ticks["tick"])
-        at_start = _springs_at_start(parameters, gains, motion)
-        at_start = at_start * ((ticks["tick"] == 0) | is_reset)
+        has_start = (ticks["tick"] == 0) | is_reset
+        at_start = _springs_at_start(parameters, gains, motion) * has_start
         totals["start_springs"] = _summed(at_start, before["start_springs"])
         if parameters.has_law and not delay:
             in_springs = stored_in_springs(parameters, gains, (motion.stretch, motion.twist))
             in_springs = in_springs - totals["start_springs"]
         excess = _device_excess(parameters, totals, created, in_springs)
-        totals |= {"created": created, "taken": np.maximum(created, 0.0) + coupling_work}
+        pulses = PulseBalance.of(block, events, created)
+        totals |= pulses.sums
+        spent = created + pulses.taken
+        totals |= {"created": created, "taken": np.maximum(spent, 0.0) + coupling_work}
         totals |= {"motors": ticks["actuator_work"], "external": ticks["external_work"]}
         totals |= _released(totals, before, stored - others_work, is_reset)
         ratio = parameters.force_scale / parameters.scale
-        pulses = PulseBalance.of(block, events, created)
-        totals |= pulses.sums
         net, unpaid = _hand_energies(parameters, totals, before, is_reset)
         held = stored_in_springs(parameters, gains, (motion.stretch, motion.twist))
         held = held - totals["start_springs"]
         # D_k = min(cap, D_{k-1} - E_k) is the lowest cap + Σ E so far, or 0, minus Σ E; what
         # pulses take counts as E
-        spent = created + pulses.taken
         ceiling = np.minimum(
             np.minimum.accumulate(parameters.tank_cap + spent), before["tank_ceiling"]
         )

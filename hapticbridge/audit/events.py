@@ -318,6 +318,7 @@ SUMS = (
     "pulse_work",
     "pulse_taken",
     "pulse_size",
+    "pulse_held",
 )
 """Names of the cumulative energies, and of the force in N that the device held last."""
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.audit.events import RunEvents
 from hapticbridge.audit.motion import Array
@@ -34,6 +35,22 @@ def _most(size: Array, spare: Array, speed: float) -> Array:
     return np.asarray((size - spare * u) * u)
 
 
+def _held(sizes: Array, is_new: NDArray[np.bool_], before: float) -> Array:
+    """Returns the largest pulse in N that the device may hold in each tick, (n,).
+
+    Args:
+        sizes: Largest pulse in N of those that are new enough, (n,).
+        is_new: True if it holds none that is older.
+        before: Value before the first of these ticks.
+    """
+    held = accumulate(
+        zip(sizes, is_new, strict=True),
+        lambda held, step: max(0.0 if step[1] else held, step[0]),
+        initial=before,
+    )
+    return np.fromiter(held, float, len(sizes) + 1)[1:]
+
+
 @dataclass(frozen=True, slots=True)
 class PulseBalance:
     """Energies of pulses in some ticks, cumulative from the first tick on.
@@ -46,6 +63,7 @@ class PulseBalance:
         short: Charges to come that the account does not cover where a pulse is sent, (n,) in J.
         size: Size of what was added up, (n,) in J.
         spare: b_s, on which pulses count, (n,) in N s/m; 0 from the first change of the coupling.
+        held: Largest pulse that the device may hold until each tick, (n,) in N.
     """
 
     account: Array
@@ -55,6 +73,7 @@ class PulseBalance:
     short: Array
     size: Array
     spare: Array
+    held: Array
 
     @classmethod
     def of(cls, block: AuditedBlock, events: RunEvents, created: Array) -> PulseBalance:
@@ -62,7 +81,7 @@ class PulseBalance:
         ticks, parameters, state = block.ticks, events.parameters, block.state
         n, ratio = len(ticks), parameters.force_scale / parameters.scale
         if parameters.impact_pulses == 0.0:
-            return cls(*(np.zeros(n) for _ in range(7)))
+            return cls(*(np.zeros(n) for _ in range(8)))
         before, d = state.sums, late_ticks(parameters)
         speed = min(parameters.guarding.speed, FASTEST)
         period = parameters.period
@@ -72,19 +91,29 @@ class PulseBalance:
         elapsed = np.maximum(1e-9 * np.diff(rows["read_ns"]), period)
         stale = has_flag(rows, TickFlag.STALE_SAMPLE)
         is_known = ~stale[1:] & ~stale[:-1]
-        # pulses of the d + 1 ticks before each one; a pause or reset makes the device forget them
+        is_reset = events.is_reset(ticks["tick"])
+        is_new = ~stale[:-1] | (rows["lever"][:-1] == 0.0) | block.is_first | is_reset
+        # pulses of the d + 1 ticks before each one; a pause makes the device forget them
         pulses = np.concatenate([state.pulses, ticks["pulse"]])
-        breaks = np.cumsum(block.is_first | events.is_reset(ticks["tick"]))
+        breaks = np.cumsum(block.is_first)
         era = np.concatenate([np.zeros(d + 1, np.int64), breaks])
-        charge, sizes, works = np.full(n, -np.inf), list[Array](), list[Array]()
+        work, sizes, works = np.full(n, -np.inf), list[Array](), list[Array]()
+        low, high = np.full((n, 3), np.inf), np.full((n, 3), -np.inf)
         for j in range(d + 1):
             first = d - j
             sent = np.where((era[first : first + n] == breaks)[:, None], pulses[first:][:n], 0.0)
             sizes.append(np.linalg.norm(sent, axis=1))
-            most = elapsed * _most(sizes[-1], spare, speed)
             works.append(np.sum(sent * moved, axis=1))
-            known = np.where(is_known, np.minimum(works[-1], most), most)
-            charge = np.maximum(charge, known)
+            work = np.maximum(work, works[-1])
+            low, high = np.minimum(low, sent), np.maximum(high, sent)
+        held = _held(np.max(sizes, axis=0), is_new, before["pulse_held"])
+        spread = np.sum((high - low) ** 2, axis=1)
+        unknown = np.divide(
+            elapsed * spread, 16.0 * spare, out=np.full(n, np.inf), where=spare > 0.0
+        )
+        work = work + np.where(spread > 0.0, unknown, 0.0)
+        most = elapsed * _most(held, spare, speed)
+        charge = np.where(is_known, np.minimum(work, most), most)
         burned = np.maximum(-np.diff(created, prepend=before["created"]), 0.0)
         taken = parameters.impact_pulses * np.minimum(ticks["blow_energy"], burned)
         own = np.linalg.norm(ticks["pulse"], axis=1)
@@ -110,6 +139,7 @@ class PulseBalance:
             short=np.where(own > 0.0, covered - (account - ratio * taken), 0.0),
             size=before["pulse_size"] + np.cumsum(np.abs(works[0]) + ratio * taken),
             spare=spare,
+            held=held,
         )
 
     @property
@@ -121,6 +151,7 @@ class PulseBalance:
             "pulse_work": self.work,
             "pulse_taken": self.taken,
             "pulse_size": self.size,
+            "pulse_held": self.held,
         }
 
     def paid(self, before: dict[str, float]) -> Array:

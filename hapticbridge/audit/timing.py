@@ -135,7 +135,8 @@ class TimingTally:
         self.uncovered = float(uncovered[-1])
         if is_behind:
             ratio = parameters.force_scale / parameters.scale
-            uncovered = uncovered + ratio * np.maximum(ticks["environment_energy"], 0.0)
+            created = ticks["environment_energy"] + balance.pulses.taken
+            uncovered = uncovered + ratio * np.maximum(created, 0.0)
         self.max_uncovered = max(self.max_uncovered, float(np.max(uncovered)))
 
     def _energy(

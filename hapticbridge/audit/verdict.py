@@ -291,7 +291,8 @@ class PassivityTally:
 
     def add(self, ticks: NDArray[np.void], balance: EnergyBalance) -> None:
         """Adds at least one record with its balance."""
-        created, start = balance.environment_energy, int(ticks["tick"][0])
+        # what pulses took was given out, too
+        created, start = balance.environment_energy + balance.pulses.taken, int(ticks["tick"][0])
         rounding = TOLERANCE * (1 + balance.throughput)
         is_unstrict = created > rounding
         allowed = balance.slack + rounding
@@ -318,7 +319,7 @@ class PassivityTally:
         )
         self.energies = {name: float(last[name]) for name in _RECORDED} | {
             "coupling_work": float(balance.coupling_work[-1]),
-            "environment_energy": float(created[-1]),
+            "environment_energy": float(balance.environment_energy[-1]),
             "device_energy": float(balance.device_energy[-1]),
             "slack": float(balance.slack[-1]),
         }

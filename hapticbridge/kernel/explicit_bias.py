@@ -87,7 +87,7 @@ def _excess(s: State, pending: float) -> float:
     energy of this tick is taken back, and none while it acts.
     """
     energy = s.energy
-    created = created_energy(energy) - pending
+    created = created_energy(energy) + s.impact.taken - pending
     excess = created - 0.5 * allowed_energy(energy)
     if energy.is_constrained:
         return 0.0

@@ -14,25 +14,28 @@ normal impulse P in N s takes from the bodies
 
 in J. The account B of the pulses gets q σ min(W, −E_k) in a tick, with q = force_scale / scale, the
 share σ of ``impact_pulses`` and the energy E_k that the environment created. This is taken from the
-tank of rigid contacts, so that no energy is spent twice. Each pulse pays for its work p·δp on the
-device. Within a time t the hand moves the device by δp <= v t, v being the guard's largest speed,
-and the device's damping beyond what the coupling needs, b_s in N s/m, burns at least b_s ‖δp‖²/t.
-So a pulse gives, beyond that, at most
+tank of rigid contacts, and counts as created where energy is judged, so that none is spent twice.
+Each pulse pays for its work p·δp on the device. Within a time t the hand moves the device by δp <=
+v t, v being the guard's largest speed, and the device's damping beyond what the coupling needs, b_s
+in N s/m, burns at least b_s ‖δp‖²/t. So a pulse gives, beyond that, at most
 
     R(p, t) = max_u (‖p‖ − b_s u) u t,    0 <= u <= v.
 
 It is charged p·δp, but no more than R; motion without a sample is charged R. A device may hold the
-force of one of the last d ticks, so that the largest of their charges counts. A pulse is sent only
-as large as B covers all charges to come, Σ_i max_{m <= d−i} R(p_{k−m}, T) <= B. What no charge
-needs falls with exp(−t/τ), so that one hard blow makes no later tap hard. Hence for any hand, with
-b >= b_s + (what the coupling needs),
+force of one of the last d ticks, and change it between two samples. The largest p·δp of these
+pulses counts then, and t Σ_i s_i²/(16 b_s) beside it, with the spread s_i of their components: of
+any motion with the same δp, one that follows the change gets no more. A device that gives no sample
+may hold the last pulse, which is charged until the next sample. A pulse is sent only as large as B
+covers all charges to come, Σ_i max_{m <= d−i} R(p_{k−m}, T) <= B. What no charge needs falls with
+exp(−t/τ), so that one hard blow makes no later tap hard. Hence for any hand, with b >= b_s + (what
+the coupling needs),
 
     Σ p·δp − Σ b_s ‖δp‖²/t <= q σ Σ min(W, −E_k),
 
 and the total out of both ports is at most what the hand put in, the scene's storage and the springs
 at the start. A pulse follows no motion, so it does not enter the condition of the coupling: the
-loop is as stable as without, and the hand gets a bounded energy. If a tick takes longer than T, R
-may exceed what was kept; the coupling's springs owe the excess (``law.owe``).
+loop is as stable as without, and the hand gets a bounded energy. If a tick takes longer than T, or
+a sample is missing, R may exceed what was kept; the coupling's springs owe the rest (``law.owe``).
 
 There is no pulse while a sample is missing, the passivity controller or the watch acts, or the
 lever is 0. Force and pulse together keep the force limit; the pulse yields.
@@ -95,7 +98,6 @@ IMPACT_DTYPE = np.dtype(
         ("is_on", "<i8"),
         ("late_ticks", "<i8"),
         ("age", "<i8"),
-        ("flight", "<i8"),
         ("share", "<f8"),
         ("angle", "<f8"),
         ("rate", "<f8"),
@@ -104,6 +106,8 @@ IMPACT_DTYPE = np.dtype(
         ("speed", "<f8"),
         ("account", "<f8"),
         ("earned", "<f8"),
+        ("taken", "<f8"),
+        ("held", "<f8"),
         ("work", "<f8"),
         ("amplitude", "<f8"),
         ("blow_energy", "<f8"),
@@ -119,12 +123,13 @@ IMPACT_DTYPE = np.dtype(
 )
 """Sub-record ``impact``, written by this module alone. ``share`` is σ, ``angle`` 2π f T in rad,
 ``rate`` T/τ, ``forgets`` 1 − exp(−T/τ), ``spare`` b_s in N s/m, ``speed`` v in m/s and
-``late_ticks`` d. ``age`` is j, −1 without a pulse, ``flight`` the ticks in which pulses may still
-act. ``account`` is B in J, ``earned`` all that it got, ``work`` Σ p·δp; ``amplitude`` A in N,
-``direction`` n in the device's frame, ``newest`` the pulse of this tick and ``sent`` those of the
-last ticks in N. ``blow_energy`` is the W of all blows of the tick, ``normal`` the sum of their
-normals times W in the scene's frame; of the largest blow W, the speed −v_n in m/s, the coefficient
-of restitution that its contact asks for, and v⁺/(−v_n)."""
+``late_ticks`` d. ``age`` is j, −1 without a pulse. ``account`` is B in J, ``earned`` all that it
+got, ``taken`` what the scene gave for it in J, ``work`` Σ p·δp; ``held`` the largest pulse in N
+that the device may hold, ``amplitude`` A in N, ``direction`` n in the device's frame, ``newest``
+the pulse of this tick and ``sent`` those of the last ticks in N. ``blow_energy`` is the W of all
+blows of the tick, ``normal`` the sum of their normals times W in the scene's frame; of the largest
+blow W, the speed −v_n in m/s, the coefficient of restitution that its contact asks for, and
+v⁺/(−v_n)."""
 
 
 def bind_pulse(impact: Part, parameters: RunParameters) -> None:
@@ -143,9 +148,14 @@ def bind_pulse(impact: Part, parameters: RunParameters) -> None:
 
 
 def forget_pulses(impact: Part) -> None:
-    """Ends the pulse, after a pause or reset in which no force was sent."""
+    """Ends the pulse and forgets those sent, after a pause in which no force was sent."""
     impact["sent"] = impact["newest"] = 0.0
-    impact["age"], impact["flight"] = -1, 0
+    impact["held"], impact["age"] = 0.0, -1
+
+
+def end_pulse(impact: Part) -> None:
+    """Ends the pulse, after a reset; the device holds the last one until the next wrench."""
+    impact["age"] = -1
 
 
 def forgo_spare_damping(impact: Part) -> None:
@@ -216,6 +226,7 @@ def earn(s: State) -> float:
     at_hand = s.run.force_scale / s.run.scale * energy
     impact.account += at_hand
     impact.earned += at_hand
+    impact.taken += energy
     impact.age = 0
     store_vector(impact.direction, device_from_scene(s.run.axes, scaled(1.0 / size, normal)))
     return float(energy)
@@ -249,15 +260,25 @@ def charge_pulses(s: State, moved: Vector, elapsed: float) -> None:
     impact, tick = s.impact, s.loop.tick
     if impact.blow_energy > 0.0:
         forget_blows(impact)
-    if impact.account == 0.0 and impact.flight == 0:
+    if impact.account == 0.0 and impact.held == 0.0:
         return
-    impact.flight = max(impact.flight - 1, 0)
     is_known = not s.loop.external_flags & STALE_SAMPLE and s.guard.time_since_sample == 0.0
-    charge = -np.inf
+    is_new = s.guard.time_since_sample == 0.0 or s.guard.lever == 0.0  # or has faded
+    charge, largest = -np.inf, 0.0 if is_new else impact.held
+    low = high = _sent(impact, tick - 1)
     for j in range(impact.late_ticks + 1):
-        sent = _sent(impact, tick - 1 - j)
-        most = elapsed * _most(impact, norm(sent))
-        charge = max(charge, min(dot(sent, moved), most) if is_known else most)
+        x, y, z = sent = _sent(impact, tick - 1 - j)
+        charge, largest = max(charge, dot(sent, moved)), max(largest, norm(sent))
+        low = (min(low[0], x), min(low[1], y), min(low[2], z))
+        high = (max(high[0], x), max(high[1], y), max(high[2], z))
+    impact.held = largest
+    if not is_known:
+        charge = np.inf
+    elif high != low:
+        spread = subtract(high, low)
+        b = 16.0 * impact.spare
+        charge += elapsed * dot(spread, spread) / b if b > 0.0 else np.inf
+    charge = min(charge, elapsed * _most(impact, largest))
     impact.work += dot(_sent(impact, tick - 1), moved)
     impact.account -= charge
     if impact.account < 0.0:
@@ -326,8 +347,6 @@ def add_pulse(s: State, force: Vector) -> Vector:
         sent = subtract(whole, force)
         force = whole
         impact.age = impact.age + 1 if envelope > FADED else -1
-    if sent != (0.0, 0.0, 0.0):
-        impact.flight = impact.late_ticks + 1
     store_vector(impact.newest, sent)
     store_vector(impact.sent[tick % SENT], sent)
     return force

@@ -668,7 +668,7 @@ def judge_balance(s: State) -> bool:
     allowed = allowed_energy(energy)
     if s.run.watches_device:
         _judge_device(s, stored, allowed)
-    _judge_environment(s, created, allowed)
+    _judge_environment(s, created + s.impact.taken, allowed)
     return math.isfinite(created)
 
 

@@ -348,7 +348,7 @@ def _take_back(s: State, kinetic: float, own: float) -> float:
         - energy.external_work
     )
     lossless.energy_debt = max(0.0, lossless.energy_debt + surplus - energy.environment_energy)
-    taken = min(lossless.energy_debt, surplus, MAX_SHARE_BACK * own)
+    taken = min(lossless.energy_debt, surplus + s.impact.taken, MAX_SHARE_BACK * own)
     if taken <= 0.0:
         return 0.0
     slower = math.sqrt(1.0 - taken / own)

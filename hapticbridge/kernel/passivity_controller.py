@@ -291,13 +291,13 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     observer, energy = s.observer, s.energy
     limit = observer.energy_credit_limit
     stored = energy.kinetic + energy.potential - energy.start_energy
-    over = energy.environment_energy - (energy.slack + energy.others_slack)
+    given = energy.environment_energy + s.impact.taken
+    over = given - (energy.slack + energy.others_slack)
     created = observer.created_energy + (over - observer.previous_created)
     observer.created_energy = max(created, -limit)
     observer.previous_created = over
     net = stored - energy.actuator_work - energy.external_work - energy.others_work
-    change = net - observer.previous_net_storage
-    gained = (s.run.force_scale / s.run.scale) * change
+    gained = (s.run.force_scale / s.run.scale) * (net - observer.previous_net_storage)
     observer.previous_net_storage = net
     # before the first tick and in a pause, the time that the device took to move is unknown
     rate = 1.0 / interval if s.loop.tick > s.guard.start_tick else 0.0
@@ -324,7 +324,7 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     observer.net_device_energy += delivered + unburnt
     observer.hand_energy += delivered - unfelt
     observer.max_hand_energy = max(observer.max_hand_energy, observer.hand_energy)
-    released = observer.springs - max(energy.environment_energy, 0.0) - energy.coupling_work
+    released = observer.springs - max(given, 0.0) - energy.coupling_work
     paid = (s.run.force_scale / s.run.scale) * max(released, 0.0)
     if s.run.is_apart:  # its tank holds what the scene released, until the hand has got it
         observer.most_paid = paid = max(observer.most_paid, paid)

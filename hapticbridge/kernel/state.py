@@ -63,6 +63,7 @@ from hapticbridge.kernel.handle import (
 from hapticbridge.kernel.impact_pulse import (
     IMPACT_DTYPE,
     bind_pulse,
+    end_pulse,
     forget_pulses,
     forgo_spare_damping,
 )
@@ -334,7 +335,7 @@ class BoundKernel:
         restore_model(self._model, self._owned)
         discard_wrench(s["loop"])
         forget_sent(s["coupling"])
-        forget_pulses(s["impact"])
+        end_pulse(s["impact"])
         direct(refresh_energies, s)(s)
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         add_reset_work(s["energy"], after - before)

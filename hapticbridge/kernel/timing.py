@@ -184,7 +184,8 @@ def keep_account(s: State, deadline_ns: int, read_ns: int, write_ns: int) -> Non
     credit = created = 0.0
     if t.device_delay_ns > 0:
         credit = s.observer.energy_credit_limit
-        created = s.run.force_scale / s.run.scale * max(s.energy.environment_energy, 0.0)
+        given = s.energy.environment_energy + s.impact.taken
+        created = s.run.force_scale / s.run.scale * max(given, 0.0)
     if not t.is_timed:  # the device held no force
         t.held = t.newest
         for i in range(6):
