@@ -195,14 +195,18 @@ def test_no_hand_gets_more_than_it_put_in(
     assert taps.kernel.state["observer"]["max_unpaid_energy"][0] <= 1e-9
 
 
-def taken_from_pulses(delay: float, frequency: float, spare: float) -> tuple[float, float]:
+def taken_from_pulses(
+    delay: float, frequency: float, spare: float, **told: Any
+) -> tuple[float, float]:
     """Returns the most that a hand got from pulses beyond what blows paid, and all they paid, in J.
 
-    The device changes its force ``delay`` periods after a sample. The hand holds it while no pulse
-    acts, and moves it along each that does, at the speed that gets most.
+    The device changes its force ``delay`` periods after a sample, and states that or what is told.
+    The hand holds it while no pulse acts, and moves it along each that does, at the speed that gets
+    most.
     """
     coupling = replace(COUPLING, stiffness=COUPLING.stiffness / 4)
-    changes = {"guarding": {"stated_delay": delay * T}, "pulse_damping": spare}
+    told = told or {"guarding": {"stated_delay": delay * T}}
+    changes = {"pulse_damping": spare} | told
     taps = tapping((0,), coupling, pulse_frequency=frequency, **changes)
     place = got = most = last = 0.0
     goal, parts = 0.0235, 20
@@ -236,6 +240,13 @@ def test_a_hand_that_follows_a_change_of_force_between_samples_gets_no_more(
     most, earned = taken_from_pulses(delay, 500.0, spare)
     assert most <= 1e-9
     assert earned > 0.1
+
+
+def test_the_time_that_a_real_device_waits_for_its_force_is_covered() -> None:
+    most, earned = taken_from_pulses(0.5, 500.0, 0.0, pulse_lag=T)
+    assert most <= 1e-9
+    assert earned > 0.1
+    assert taken_from_pulses(0.5, 500.0, 0.0, pulse_lag=0.0)[0] > 0.1
 
 
 def test_a_device_without_samples_is_charged_for_the_pulse_that_it_holds() -> None:
@@ -323,6 +334,13 @@ def test_a_pulse_halves_the_error_of_a_tap_on_a_wall_of_1_kn_per_m(speed: float,
 
 
 # Options
+
+
+@pytest.mark.parametrize(("is_real", "ticks"), [(True, 1), (False, 0)])
+def test_a_pulse_may_act_a_tick_later_on_a_real_device(is_real: bool, ticks: int) -> None:
+    device = ScriptedDevice(lambda _: (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), is_real=is_real)
+    setup = Bridge("virtual_wall", device, impact_pulses=1.0).setup
+    assert setup.parameters(device.start(T), None).pulse_ticks == ticks
 
 
 def test_names_and_numbers_of_pulses() -> None:

@@ -366,6 +366,6 @@ class AuditState:
             since_sample=0.0,
             rise_ticks=float(parameters.ramp_ticks),
             start_energy=float(starts["start_kinetic"][0] + starts["start_potential"][0]),
-            pulses=np.zeros((round(parameters.device_delay / parameters.period) + 1, 3)),
+            pulses=np.zeros((parameters.pulse_ticks + 1, 3)),
             sums=dict.fromkeys(SUMS, 0.0),
         )

@@ -15,7 +15,6 @@ from hapticbridge.audit.motion import Array
 from hapticbridge.audit.structure import TOLERANCE, Deviation
 from hapticbridge.audit.wrench_limits import AuditedBlock
 from hapticbridge.kernel.impact_pulse import FASTEST
-from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import UNITS, TickFlag, has_flag
 from hapticbridge.kernel.restitution import BLOW_SPEED
 
@@ -82,7 +81,7 @@ class PulseBalance:
         n, ratio = len(ticks), parameters.force_scale / parameters.scale
         if parameters.impact_pulses == 0.0:
             return cls(*(np.zeros(n) for _ in range(8)))
-        before, d = state.sums, late_ticks(parameters)
+        before, d = state.sums, parameters.pulse_ticks
         speed = min(parameters.guarding.speed, FASTEST)
         period = parameters.period
         spare = np.where(ticks["tick"] < events.first_change, parameters.pulse_damping, 0.0)
@@ -169,8 +168,3 @@ class PulseBalance:
         for name, least in BLOW.items():
             wrong = np.where(has_blow, least - ticks[name], np.abs(ticks[name]))
             yield Deviation(name, wrong, 0.0, UNITS[name], "blows")
-
-
-def late_ticks(parameters: RunParameters) -> int:
-    """Returns d, the ticks by which the device states to be late."""
-    return round(parameters.device_delay / parameters.period)

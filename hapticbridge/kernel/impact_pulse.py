@@ -37,6 +37,9 @@ at the start. A pulse follows no motion, so it does not enter the condition of t
 loop is as stable as without, and the hand gets a bounded energy. If a tick takes longer than T, or
 a sample is missing, R may exceed what was kept; the coupling's springs owe the rest (``law.owe``).
 
+d is the stated delay, and a tick more of a real device, whose force is computed while the tick
+passes. Positions are those that were read: an encoder's steps Δ blur the bound by Δ/2 Σ ‖Δp‖.
+
 There is no pulse while a sample is missing, the passivity controller or the watch acts, or the
 lever is 0. Force and pulse together keep the force limit; the pulse yields.
 
@@ -62,10 +65,10 @@ from hapticbridge.kernel.codes import (
 )
 from hapticbridge.kernel.handle import device_from_scene
 from hapticbridge.kernel.jit import compiled
-from hapticbridge.kernel.law import SENT, felt, owe
+from hapticbridge.kernel.law import felt, owe
 from hapticbridge.kernel.ledger import opened_by_mocap
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
-from hapticbridge.kernel.parameters import RunParameters, whole_ticks
+from hapticbridge.kernel.parameters import SENT, RunParameters
 from hapticbridge.kernel.passivity_controller import largest_power
 from hapticbridge.kernel.pose import (
     Vector,
@@ -142,8 +145,7 @@ def bind_pulse(impact: Part, parameters: RunParameters) -> None:
     impact["forgets"] = -math.expm1(-period / parameters.pulse_decay)
     impact["spare"] = parameters.pulse_damping
     impact["speed"] = min(parameters.guarding.speed, FASTEST)
-    late = whole_ticks(parameters.guarding.stated_delay, period)
-    impact["late_ticks"] = min(late, SENT - 2)
+    impact["late_ticks"] = parameters.pulse_ticks
     impact["age"] = -1
 
 

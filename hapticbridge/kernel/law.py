@@ -40,7 +40,7 @@ from hapticbridge.kernel.handle import (
 from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.ledger import SLACK_SHARE, moment_dot
 from hapticbridge.kernel.mujoco_c import floats
-from hapticbridge.kernel.parameters import ALL_MOTORS, RunParameters, whole_ticks
+from hapticbridge.kernel.parameters import ALL_MOTORS, SENT, RunParameters, whole_ticks
 from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
@@ -73,9 +73,6 @@ TUNED = (*_LAW, *_SLACK)
 """Numbers of the state that depend on the coupling, besides the gains of its actuators."""
 
 _TUNED_DTYPE = np.dtype([*((name, "<f8") for name in TUNED), ("gains", "<f8", 6)])
-
-SENT = 64
-"""Ticks of which lever, wrench and turn are kept; a device is at most 50 samples late."""
 
 COUPLING_DTYPE = np.dtype(
     [

@@ -36,6 +36,10 @@ def _mask(default: int = 0) -> Any:
     return option(default, least=0, most=2**MAX_BUTTONS - 1)
 
 
+SENT = 64
+"""Ticks of which what was sent is kept; a device is at most 50 samples late."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardParameters:
     """Limits and thresholds of the guard within a tick; all are off by default.
@@ -289,6 +293,8 @@ class RunParameters(StepTimes):
         pulse_decay: τ in s of the pulses.
         pulse_damping: b_s in N s/m, the damping of the device on which pulses count, beyond what
             the coupling needs.
+        pulse_lag: Time in s within which a pulse may act beyond the stated delay: a tick of a real
+            device, whose force is computed while the tick passes; 0 of a simulated one.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -322,6 +328,7 @@ class RunParameters(StepTimes):
     pulse_frequency: float = option(0.0, unit="Hz", least=0.0)
     pulse_decay: float = option(0.01, unit="s", least=0.0, is_open=True)
     pulse_damping: float = option(0.0, unit="N s/m", least=0.0)
+    pulse_lag: float = option(0.0, unit="s", least=0.0)
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -380,6 +387,11 @@ class RunParameters(StepTimes):
     def device_delay(self) -> float:
         """Delay t_d in s that the device states, in whole ticks, rounded up."""
         return whole_ticks(self.guarding.stated_delay, self.period) * self.period
+
+    @property
+    def pulse_ticks(self) -> int:
+        """Ticks d after its own in which a pulse may still act, at most as many as are kept."""
+        return min(whole_ticks(self.guarding.stated_delay + self.pulse_lag, self.period), SENT - 2)
 
     @property
     def tank_at_start(self) -> float:

@@ -734,6 +734,7 @@ class RunSetup(StepTimes):
             pulse_frequency=self.pulse[0],
             pulse_decay=self.pulse[1],
             pulse_damping=self.pulse_damping,
+            pulse_lag=self.period if self.impact_pulses and self.info.is_real else 0.0,
         )
 
     def _loaded(self, parameters: RunParameters) -> RunParameters:
