@@ -245,7 +245,7 @@ def test_a_changed_record_is_not_drawn(sway: Path, tmp_path: Path) -> None:
         stage.show(100)
     ticks["tool_position"][100, 0] -= 1.5e-4
     Stage(rewritten(recording, tmp_path / "nearly.mcap", ticks=ticks)).show(100)
-    versions = json.dumps({"mujoco": "3.0.0", "hapticbridge": "0.1.0", "numba": "0"})
+    versions = json.dumps({"mujoco": "3.0.0", "hapticbridge": hb.__version__, "numba": "0"})
     with pytest.raises(RecordingError, match="recorded with mujoco 3"):
         Stage(rewritten(recording, tmp_path / "old.mcap", meta={"versions": versions}))
 

@@ -104,9 +104,13 @@ def test_what_device_clock_and_options_cannot_do_together_is_refused(
 
 
 def test_a_setup_holds_the_choices_that_were_left_open(scene: Scene) -> None:
-    setup = RunSetup.resolve(scene, REAL, None, BridgeOptions(), RealClock())
+    timely = replace(REAL, delay=0.0, is_delay_measured=True)
+    setup = RunSetup.resolve(scene, timely, None, BridgeOptions(), RealClock())
     assert (setup.method.name, setup.period) == ("lossless", 1e-3)
     assert setup.coupling.stiffness == pytest.approx(2400.0)  # 80 % of 2 (b - b/4) / T
+    unknown = RunSetup.resolve(scene, REAL, None, BridgeOptions(), RealClock())
+    stated = RunSetup.resolve(scene, replace(REAL, delay=0.0), None, BridgeOptions(), RealClock())
+    assert setup.coupling.stiffness > unknown.coupling.stiffness == stated.coupling.stiffness
     expected = Coupling(2400.0, 0.5, 2.4, 5e-4)
     assert asdict(setup.law) == pytest.approx(asdict(expected), rel=1e-12)
     assert setup.attainable == setup.coupling

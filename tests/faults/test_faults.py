@@ -127,7 +127,13 @@ class GivesWay:
     """
 
     info = DeviceInfo(
-        name="yielding", axes=("x", "y", "z"), force_limit=10.0, damping=0.2, is_real=False
+        name="yielding",
+        axes=("x", "y", "z"),
+        force_limit=10.0,
+        damping=0.2,
+        delay=0.0,
+        is_delay_measured=True,
+        is_real=False,
     )
 
     def __init__(self, slow_until: float) -> None:
