@@ -8,7 +8,7 @@ the device alone, thrown at the wall:
 
 Behind the coupling the wall is rigid and the tool has no mass, so the tool y is at the wall while
 f = −(K e + B'/T δe) pushes, e = h − y, and else where f = 0. The error is that of
-``check.perception``, against a spring of 40 kN/m without delay: no force at all would be 14 JND.
+``check.perception``, against a spring of 40 kN/m without delay. A line shows that of no force.
 """
 
 from __future__ import annotations
@@ -148,11 +148,19 @@ def tap(
     return forces[:count]
 
 
-def felt(device: DeviceInfo, loop: Loop) -> float:
-    """Returns the error of a tap in just noticeable differences of the ideal wall's force."""
-    period, ideal = 1.0 / loop.rate, wall(Coupling(IDEAL, 0.0, 0.0, 0.0), STEP)
+def felt(device: DeviceInfo, loop: Loop | None) -> float:
+    """Returns the error of a tap in just noticeable differences of the ideal wall's force.
+
+    Args:
+        device: The device.
+        loop: The loop that renders the wall; without one the device gets no force.
+    """
+    ideal = wall(Coupling(IDEAL, 0.0, 0.0, 0.0), STEP)
     exact = tap(replace(device, resolution=0.0), ideal, STEP, 0.0)
-    found = tap(device, wall(loop.coupling(device), period), period, loop.delay)
+    found = np.zeros_like(exact)
+    if loop is not None:
+        period = 1.0 / loop.rate
+        found = tap(device, wall(loop.coupling(device), period), period, loop.delay)
     return felt_error(_records(exact), _records(found)).jnd
 
 
@@ -164,7 +172,7 @@ def _records(forces: NDArray[np.float64]) -> NDArray[np.void]:
 
 def draw() -> Figure:
     """Draws stiffness and felt error of all loops, with the encoder's steps and without."""
-    figure = new_figure(8.0, 3.4)
+    figure = new_figure(8.0, 3.7)
     hardness, error = figure.subplots(1, 2, sharey=True)
     exact = replace(DEVICE, resolution=0.0)
     kinds = (("steps of 10 µm, friction 0.1 N", DEVICE, "C0"), ("without steps", exact, "C7"))
@@ -179,12 +187,17 @@ def draw() -> Figure:
     hardness.set_yticks(range(len(LOOPS)), [loop.label for loop in LOOPS])
     hardness.invert_yaxis()
     hardness.legend(loc="upper right", fontsize=8)
-    error.set(xlabel=f"error of a tap on {1e-3 * IDEAL:g} N/mm (JND)", xlim=(0.0, 17.0))
-    error.axvline(1.0, color="black", ls="--", lw=0.9)
-    error.annotate(
-        "just noticeable", (1.0, 1.0), (4, 2), xycoords=("data", "axes fraction"),
-        textcoords="offset points", fontsize=8,
-    )  # fmt: skip
+    error.set(
+        xlabel=f"error of a tap on {1e-3 * IDEAL:g} N/mm\n(just noticeable differences of force)",
+        xlim=(0.0, 18.0),
+    )
+    for value, label in ((1.0, "just noticeable"), (felt(exact, None), "no force at all")):
+        error.axvline(value, color="black", ls="--", lw=0.9)
+        error.annotate(
+            label, (value, 1.0), (0, 2), xycoords=("data", "axes fraction"),
+            textcoords="offset points", fontsize=8, ha="center",
+        )  # fmt: skip
+    figure.suptitle(f"a device of {DEVICE.mass:g} kg with b = {DEVICE.damping:g} N s/m", fontsize=9)
     for axes in (hardness, error):
         axes.spines[["top", "right"]].set_visible(False)
     return figure
