@@ -727,6 +727,29 @@ def test_a_motor_that_pushes_with_its_own_velocity_is_a_pump(
     assert not found("unused", bias=1.01 * limit, biastype="none")
 
 
+GAINING = """<mujoco><option timestep="0.001"/><worldbody><body>
+<joint name="x" type="slide" damping="3"/><geom size="0.02" mass="0.5"/><site name="grip"/></body>
+</worldbody><actuator>{}</actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("actuator", "told"),
+    [
+        ('general gaintype="affine" gainprm="0 0 2"', "velocity gain 2 at controls above 1.5"),
+        ('general gaintype="affine" gainprm="0 0 -2"', "velocity gain -2 at controls below -1.5"),
+        ('general gaintype="affine" gainprm="0 0 2" ctrlrange="-9 1.4"', ""),
+        ('general gaintype="affine" gainprm="0 0 2" ctrlrange="-9 1.6"', "above 1.5"),
+        ('damper kv="2" ctrlrange="0 9"', ""),
+        ('general gaintype="affine" gainprm="3 4 0"', ""),
+    ],
+)
+def test_a_motor_whose_gain_grows_with_its_velocity_is_a_pump_under_some_control(
+    tmp_path: Path, actuator: str, told: str
+) -> None:
+    found = faults_in(tmp_path, GAINING.format(f'<{actuator} joint="x"/>'))
+    assert [told in f.sentence for f in found if f.kind == "pump"] == [True] * bool(told)
+
+
 def test_a_tool_that_starts_in_a_height_field_is_told_to_start_outside(tmp_path: Path) -> None:
     """The advice, followed, ends the finding."""
     text = """<mujoco><option timestep="0.001" integrator="discrete" cone="elliptic"/><asset>

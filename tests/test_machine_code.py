@@ -292,6 +292,17 @@ def test_a_compiler_that_the_user_disabled_is_told(
     assert list(folder.iterdir())
 
 
+def test_a_setting_that_the_compiler_refuses_is_told(tmp_path: Path) -> None:
+    """The package must be compiled anew, as after an update; numba then ends its own import."""
+    none = {**os.environ, "NUMBA_NUM_THREADS": "0", "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-m", "hapticbridge", "run", "point_mass", "--fast"]
+    ended = subprocess.run(command, env=none, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    last = ended.stderr.splitlines()[-1]
+    assert last.startswith("error: the compiler numba refuses a setting of the environment: ")
+    assert "NUMBA_NUM_THREADS" in last
+
+
 OPEN: dict[str, tuple[str, int]] = {
     "writable by all": ("cache/machine_code", 0o777),
     "writable by its group": ("cache/machine_code", 0o770),

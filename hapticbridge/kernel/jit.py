@@ -206,7 +206,7 @@ class Compiled(Deferred):
         return self._c(c_types)
 
     def _c(self, c_types: tuple[str, ...]) -> int:
-        numba, called = import_module("numba"), self.built
+        numba, called = _numba(), self.built
         names = {"ptr": "intp", "i64": "intp", "i32": "int32", "double": "float64"}
         signature = f"int32({', '.join(names[kind] for kind in c_types)})"
 
@@ -307,9 +307,16 @@ def _numba() -> Any:
     """Imports numba.
 
     Raises:
-        HapticBridgeError: The user disabled its compiler.
+        HapticBridgeError: The user disabled its compiler, or has a setting that it refuses.
     """
-    numba = import_module("numba")
+    try:
+        numba = import_module("numba")
+    except ValueError as error:
+        names = ", ".join(sorted(name for name in os.environ if name.startswith("NUMBA_")))
+        raise HapticBridgeError(
+            f"the compiler numba refuses a setting of the environment: {error} Set are "
+            f"{names or 'none'}; unset the one that it means"
+        ) from None
     if numba.config.DISABLE_JIT:
         raise HapticBridgeError(
             "NUMBA_DISABLE_JIT is set, and a tick calls MuJoCo from compiled code alone; unset it"
@@ -382,7 +389,7 @@ _decorating = threading.Lock()
 
 
 def _signature(arguments: tuple[object, ...]) -> tuple[Any, ...]:
-    return tuple(map(import_module("numba").typeof, arguments))
+    return tuple(map(_numba().typeof, arguments))
 
 
 def compiled(function: _Function) -> _Function:

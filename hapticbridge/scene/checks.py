@@ -117,8 +117,9 @@ class Pump:
 def pumps(model: mujoco.MjModel, data: mujoco.MjData) -> list[Pump]:
     """Returns the joints and actuators that put energy into what moves already.
 
-    An actuator with the velocity bias g pushes with the power g (m·v)², joints with the damping d
-    take Σ d_i v_i². At some velocity v the first is larger exactly if
+    An actuator with the velocity bias g_0 and the velocity gain g_1 under its control u pushes with
+    the power g (m·v)², g = g_0 + g_1 u, joints with the damping d take Σ d_i v_i². At some velocity
+    v the first is larger exactly if
 
         g > d_a + d_t/m_t² + 1/Σ (m_i²/d_i)
 
@@ -136,23 +137,39 @@ def pumps(model: mujoco.MjModel, data: mujoco.MjData) -> list[Pump]:
             name = _joint_name(model, joint)
             words = f"{name} has a damping of {damping:.3g}: it pushes what moves already"
             found.append(Pump("joint", joint, words, 'damping="0" or more'))
-    for actuator in np.flatnonzero(
-        (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
-        & (model.actuator_biasprm[:, 2] > 0.0)
-    ).tolist():
-        bias, offset = (
-            float(model.actuator_biasprm[actuator, 2]),
-            _offset_bias(model, data, actuator),
-        )
-        if bias > offset:
+    for actuator in range(model.nu):
+        if pushes := _pushes(model, data, actuator):
+            cause, array = pushes
             words = (
                 f"actuator '{model.actuator(actuator).name or actuator}' pushes "
-                f"{driven_name(model, actuator)} harder the faster it moves (velocity bias "
-                f"{bias:.3g}; damping there offsets {offset:.3g})"
+                f"{driven_name(model, actuator)} harder the faster it moves ({cause})"
             )
-            change = "a third number of at most 0 in its biasprm"
+            most = "at most 0" if array == "biasprm" else "0"
+            change = f"a third number of {most} in its {array}"
             found.append(Pump("actuator", actuator, words, change))
     return found
+
+
+def _pushes(model: mujoco.MjModel, data: mujoco.MjData, actuator: int) -> tuple[str, str] | None:
+    """Returns by what an actuator pumps, and the attribute that says so; None if it does not."""
+    bias = gain = most = 0.0
+    if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE:
+        bias = float(model.actuator_biasprm[actuator, 2])
+    if model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_AFFINE:
+        gain = float(model.actuator_gainprm[actuator, 2])
+    if gain != 0.0:
+        is_limited = bool(model.actuator_ctrllimited[actuator])
+        controls = model.actuator_ctrlrange[actuator] if is_limited else (-math.inf, math.inf)
+        most = max(gain * float(control) for control in controls)
+    if bias + most <= 0.0:
+        return None
+    offset = _offset_bias(model, data, actuator)
+    if bias > offset:
+        return f"velocity bias {bias:.3g}; damping there offsets {offset:.3g}", "biasprm"
+    if bias + most > offset:
+        where = f"controls {'above' if gain > 0.0 else 'below'} {(offset - bias) / gain:.3g}"
+        return f"velocity gain {gain:.3g} at {where}", "gainprm"
+    return None
 
 
 def first_pump(model: mujoco.MjModel) -> Pump | None:
