@@ -490,20 +490,9 @@ def write_dataset(
     return WrittenDataset(folder, tuple(counts), tuple(map(_resets, recordings)))
 
 
-AGAIN = 50
-"""Ticks within which a program that places its tool at the same pose repeats what it has said."""
-
-
 def _placings(recording: RecordingFile) -> list[Mapping[str, Any]]:
     """Returns the resets of a run, and of another program's tool where it was placed anew."""
-    found: list[Mapping[str, Any]] = []
-    for event in recording.events:
-        if event.get("event") == "reset":
-            last = found[-1] if found else {}
-            is_near = event.get("tick", 0) - last.get("tick", -AGAIN) < AGAIN
-            if not (is_near and "pose" in event and event["pose"] == last.get("pose")):
-                found.append(event)
-    return found
+    return [event for event in recording.events if event.get("event") == "reset"]
 
 
 def _placed_at(recording: RecordingFile) -> int:
