@@ -29,6 +29,7 @@ from hapticbridge import (
     audit,
     read_recording,
 )
+from hapticbridge.audit.batch import audit_all
 from hapticbridge.errors import DeviceLost, HapticBridgeError
 from hapticbridge.program import poses
 from hapticbridge.program.device_loop import Handle, Surface
@@ -154,6 +155,8 @@ def test_a_tool_that_moves_at_once_is_placed_where_it_was_put(
             device.advance(0.02) if is_simulated else time.sleep(0.1)
     events = read_recording(path).events
     assert [event["pose"][2] for event in events if event["event"] == "reset"] == tops
+    # of a program's scene nothing is known, in a table either
+    assert audit_all([path]).texts("environment").tolist() == ["toward the hand"]
 
 
 # What a program may say

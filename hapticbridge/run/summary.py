@@ -444,8 +444,10 @@ class Summary:
         if self.reach is not None:
             yield "reach", f"{format_si(self.reach, 'm')}; beyond, no handle and no force"
         for name, text in energy_rows(self.energies, self.start_potential, self.credit):
-            of_tank = ", what the program may still give to the hand" if name == "tank" else ""
-            yield name, text + of_tank
+            remark = ", what the program may still give to the hand" if name == "tank" else ""
+            if name == "device energy" and not self.has_hand:
+                remark = ", of forces that were not felt"
+            yield name, text + remark
         so_far = "with the tick that tripped, " if self.trip else ""  # the record is without it
         if self.max_net_energy > INSTANT:
             yield "net to the hand", so_far + self.hand_energy.sentence
