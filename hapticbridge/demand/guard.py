@@ -42,8 +42,8 @@ USUAL_STRETCH = 0.2
 smaller limit stops users who pull on a stuck tool; a larger one misses a lost tool."""
 
 USUAL_ANGLE = 2.8
-"""Angle limit in rad. At π the coupling's torque changes sign; 160 degrees leave room for one
-tick."""
+"""Angle limit in rad. The handle slips at 2.5, so that beyond this limit the tool has turned by 0.3
+rad in one tick. At π the coupling's torque changes sign."""
 
 USUAL_ENERGY = 0.04
 """Energy limit in J, given to the device beyond the hand's own work: 10 N over 4 mm, a nudge and no
@@ -73,6 +73,8 @@ class Limits:
         stretch: Largest distance between handle and tool divided by the scale, in m; beyond it the
             run is stopped.
         angle: Largest angle between handle and tool in rad, below pi; beyond it the run is stopped.
+            With a hand on the device the handle slips at 2.5, so a larger limit stops only a tool
+            that turns away within a tick.
         energy: Largest energy in J that the hand may get beyond what it put in and what the scene's
             storage gave. The storage is that of all bodies together: what bodies lose beside the
             tool may pass from motors to the hand on top. A wrench that would pass the limit is not
