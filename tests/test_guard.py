@@ -121,7 +121,7 @@ def test_a_coupling_that_is_stretched_too_far_stops_the_run(tmp_path: Path, scal
     assert not outcomes[0.2].error
 
 
-@pytest.mark.parametrize("angle", [1.0, 2.8])
+@pytest.mark.parametrize("angle", [2.8, math.inf])
 def test_a_coupling_that_is_turned_too_far_stops_the_run_or_slips(
     tmp_path: Path, angle: float
 ) -> None:
@@ -139,7 +139,7 @@ def test_a_coupling_that_is_turned_too_far_stops_the_run_or_slips(
     ticks = read_recording(path).ticks
     torque = ticks["wrench_on_tool"][:, 5]
     assert (torque[1:] > 0).all()
-    if angle > LARGEST_TWIST:
+    if angle == math.inf:
         assert not error
         slipped = (ticks["flags"] & REANCHORED) != 0
         assert slipped.argmax() == pytest.approx(LARGEST_TWIST / 4e-3, abs=2)

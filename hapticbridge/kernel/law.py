@@ -96,9 +96,10 @@ COUPLING_DTYPE = np.dtype(
 in N m along axes without motor, ``idle`` those while the hand is let go. ``twist_damping`` in
 N m s/rad, seen at the tool, is the damping that pays for a torque across the motion."""
 
-LARGEST_TWIST = 2.5
-"""Largest twist in rad of a coupling that a hand holds; beyond it the handle slips. It leaves 0.64
-rad of one tick's turns to half a turn, where the torque reverses. A larger one leaves less."""
+LARGEST_TWIST, STOPPED_TWIST = 2.5, 2.8
+"""Twist in rad from which the handle slips that a hand holds behind a late device, or in a run that
+is not stopped at the second. They leave 0.64 and 0.34 rad for the turns of one tick to half a turn,
+where the torque reverses. Larger ones leave less."""
 
 _GAINS = 10  # numbers per actuator in actuator_gainprm and actuator_biasprm (mjNGAIN, mjNBIAS)
 
@@ -655,8 +656,8 @@ def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     Five things make it slip. A late sample or wrench is charged (``charge_lateness``,
     ``charge_lag``). A raised gain must not raise the spring's energy. Along an axis without motor
     the coupling holds up to ``hold`` and then slips. While the hand is let go it relaxes to
-    ``idle``. A twist of a hand ends at ``LARGEST_TWIST``. Each only shortens the spring, so energy
-    is lost and none is gained.
+    ``idle``. A twist ends at ``LARGEST_TWIST`` where no limit stops the run, and behind a late
+    device. Each only shortens the spring, so energy is lost and none is gained.
 
     **Derivation of the last.** Up to half a turn V(φ) = ½ K_r ‖φ‖² is convex along every turn, and
     its torque changes by at most K_r ‖δφ‖ beside the turn of its direction, which ``charge_lag``
@@ -678,7 +679,7 @@ def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     k = s.coupling
     linear, angular = springs(s)
     stretch, twist = pulled(s)
-    if s.guard.has_hand:
+    if s.guard.has_hand and (k.late_ticks > 0 or s.guard.max_angle > STOPPED_TWIST):
         max_twist = min(max_twist, LARGEST_TWIST)
     if k.owed[0] > 0.0 or k.owed[1] > 0.0:
         length, k.owed[0] = _paid(linear, norm(stretch), k.owed[0])
