@@ -156,3 +156,73 @@ def test_a_device_whose_steps_shake_it_is_passive_but_for_them(
     assert "next:" not in out
     opened.info = replace(opened.info, friction=1.0)
     assert call(*command)[0] == 0
+
+
+OWN_LOOP = "--loop-rate 1e4 --loop-delay 1e-5"
+
+
+@pytest.mark.parametrize(
+    ("numbers", "stiffness", "words"),
+    [
+        ("--device-damping 2", 2400.0, "if its friction holds the encoder's steps: --friction"),
+        (
+            "--device-damping 2 --friction 0.01 --resolution 1e-5",
+            1200.0,
+            "friction 10 mN >= 8.5 mN",
+        ),
+        ("--device-damping 2 --resolution 0", 2400.0, "passive in any hand method lossless"),
+        (
+            f"--device-damping 2 --friction 0.1 --resolution 1e-5 {OWN_LOOP}",
+            17000.0,
+            "for its step",
+        ),
+        (f"--device-damping 2 {OWN_LOOP}", 26153.8, "not judged are the encoder's steps"),
+        ("--device simulated:damping=1", 1200.0, "device damping 1 >= 0.85 N s/m: passive in any"),
+        ("--device simulated:delay=2", 1307.9, "its delay is unknown; without one"),
+    ],
+)
+def test_without_a_stiffness_it_is_the_one_that_a_run_chooses(
+    numbers: str, stiffness: float, words: str, call: Called
+) -> None:
+    code, out, _ = call(*f"bound {numbers}".split())
+    told = " ".join(out.split())
+    assert code == 0
+    assert told.startswith("as 'hapticbridge run' chooses it: K = ")
+    assert words in told
+    assert ("encoder's steps" in told) is ("--resolution" not in numbers and "sim" not in numbers)
+    requested = facts_of(call, *f"bound {numbers}".split())[1]["coupling"]["requested"]
+    assert requested["stiffness"] == pytest.approx(stiffness, rel=1e-4)
+
+
+def test_the_steps_of_a_stated_encoder_are_judged(call: Called) -> None:
+    command = "bound --stiffness 2000 --damping 1.5 --device-damping 2 --resolution 1e-5 --friction"
+    assert call(*command.split(), 0.02)[0] == 0
+    code, out, _ = call(*command.split(), 0.01)
+    assert code == 1
+    assert "passive in any hand but for its encoder's steps" in " ".join(out.split())
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ("", "bound needs --stiffness, or --device or --device-damping without --damping"),
+        ("--device-damping 2 --damping 1", "bound needs --stiffness, or --device or"),
+        ("--device simulated --friction 1", "--friction and --resolution go with --device-damping"),
+        ("--stiffness 1 --resolution 1e-5", "--friction and --resolution go with --device-damping"),
+    ],
+)
+def test_what_it_cannot_choose_or_judge_is_refused(options: str, reason: str, call: Called) -> None:
+    code, _, err = call(*f"bound {options}".split())
+    assert (code, reason in err) == (2, True)
+
+
+def test_its_help_has_the_exit_code_of_what_is_not_judged(call: Called) -> None:
+    told = " ".join(call("bound", "--help")[1].split())
+    assert "0 if it does, or if it cannot be judged because the device's delay is unknown" in told
+
+
+def test_the_z_width_names_the_command_for_a_loop_on_the_board(call: Called) -> None:
+    told = call("zwidth", "--damping", 2)[1]
+    [command] = re.findall(r"bears more: 'hapticbridge (bound .*)'", " ".join(told.split()))
+    code, facts = facts_of(call, *command.replace("HZ", "1e4").replace("SECONDS", "1e-5").split())
+    assert (code, facts["coupling"]["requested"]["stiffness"] > 20_000.0) == (0, True)

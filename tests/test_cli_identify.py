@@ -13,7 +13,7 @@ from hapticbridge.cli import main, terminal
 from hapticbridge.cli.identify import coupling_of_run
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.demand.certificate import default_coupling
-from hapticbridge.device import open_device
+from hapticbridge.device import DeviceInfo, open_device
 from hapticbridge.device.profile import read_profile
 from hapticbridge.identify import Estimate, identify
 from hapticbridge.identify.identify import delay_of, measured_profile
@@ -64,8 +64,18 @@ def test_it_says_what_a_class_states_and_as_how_many_ticks_a_delay_counts(
     told = " ".join(capsys.readouterr().out.split())
     unknown = replace(open_device(FREE).info, damping=None, mass=None, friction=None, delay=None)
     sheet = read_profile(path).fill(unknown)
-    assert f"DeviceInfo(mass={sheet.mass:.4g}, damping={sheet.damping:.4g}, friction=" in told
-    assert "delay=0.003); the delay counts as 3 ticks" in told
+    assert f"DeviceInfo(mass={sheet.mass:.6g}, damping={sheet.damping:.6g}, rotational" in told
+    assert "delay=0.003, is_delay_measured=True); the delay counts as 3 ticks" in told
+    # pasted into a class, it gives the advised coupling
+    [numbers] = re.findall(r"in a class of your own: DeviceInfo\((.*?)\);", told)
+    stated = eval(f"dict({numbers})")
+    pasted = DeviceInfo(name="own", axes=("x",), force_limit=1.0, **stated)
+    advised = re.findall(r"--stiffness ([0-9.]+) --damping ([0-9.]+)", told)[0]
+    coupling = default_coupling(pasted, 1e-3)
+    assert (coupling.stiffness, coupling.damping) == pytest.approx(
+        tuple(map(float, advised)), rel=2e-5
+    )
+    assert pasted.resolution == 2e-5
     # behind a delay a damper lowers what a wall asks of the device, so that K may be larger
     at_rest, with_damper = re.findall(r"([0-9.]+) N/m at B_law = ", told)
     assert float(with_damper) > 1.2 * float(at_rest)

@@ -511,7 +511,7 @@ def test_options_reach_the_device_and_the_specification_goes_first(tmp_path: Pat
     assert (both.info.damping, both.hand) == (5.0, Hand(mass=0.3))
     free: Any = open_device("simulated:hand=none", path=written(tmp_path / "hand.csv"))
     assert (free.hand, free.info.duration) == (None, None)
-    file = written(tmp_path / "a,b=c:d.csv")
+    file = written(tmp_path / "a,mass=c:d.csv")
     guided: Any = open_device(f"simulated:friction=0.1,path={file}", hand=Hand(stiffness=50.0))
     assert guided.info.duration == pytest.approx(0.195)
     assert guided.hand == Hand(stiffness=50.0)
@@ -546,6 +546,12 @@ def test_options_reach_the_device_and_the_specification_goes_first(tmp_path: Pat
         ("simulated:hand=left", {}, "hand is 'left'; it must be 'none'; 'hand_damping'"),
         ("simulated:hand=none,hand_mass=1", {}, "hand and 'hand_mass' exclude each other"),
         ("simulated:path=/no/such.csv", {}, "/no/such.csv: no such file"),
+        (
+            "simulated:friction=0.1,path=a,b.csv,mass=0.1,damping=3",
+            {},
+            "path= must come last, because all text after it is the file's name: write "
+            "mass=0.1,damping=3,path=a,b.csv",
+        ),
         ("trajectory", {}, "trajectory needs a file: 'trajectory:FILE'"),
         ("trajectory:a.csv", {"damping": 2}, "unknown option 'damping' of the trajectory device"),
     ],

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cli_cases import Called
@@ -13,9 +15,10 @@ from cli_cases import Called
 import hapticbridge as hb
 from hapticbridge.device import Device, open_device
 from hapticbridge.device.discovery import blind_spots
+from hapticbridge.device.driver import Notify
 from hapticbridge.device.registry import all_drivers, driver_named, is_driver
 from hapticbridge.errors import DeviceError
-from hapticbridge.testing.device_contract import CONTRACT
+from hapticbridge.testing.device_contract import CONTRACT, Check
 
 GUIDE = Path(hb.__file__).parent / "guide/device_package.md"
 
@@ -57,6 +60,15 @@ def test_the_template_fulfils_the_contract(check: Callable[[Device], None]) -> N
     check(open_device("rail"))
 
 
+@pytest.mark.parametrize("check", CONTRACT, ids=lambda check: check.__name__)
+def test_the_class_of_the_guide_to_a_device_in_python_fulfils_the_contract(check: Check) -> None:
+    text = (GUIDE.parent / "own_device.md").read_text(encoding="utf-8")
+    [program] = re.findall(r"\n```python\n(.*?)\nwith hb.Bridge", text, re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(program, names)
+    check(names["Rail"](), clock=hb.SimulatedClock())
+
+
 @pytest.mark.usefixtures("rail")
 def test_the_template_is_listed_opened_and_run_by_its_name(call: Called) -> None:
     code, out, _ = call("devices")
@@ -69,11 +81,31 @@ def test_the_template_is_listed_opened_and_run_by_its_name(call: Called) -> None
         DeviceError, match=r"unknown device 'ral'; did you mean 'rail'. choose one of .*'rail'"
     ):
         open_device("ral")
-    with pytest.raises(DeviceError, match="'rail' moves in real time"):
-        hb.Bridge("point_mass", "rail", clock=hb.SimulatedClock())
     names: dict[str, object] = {}
     exec(blocks()["test_rail.py"], names)
     assert "test_the_rail_fulfils_the_contract" in names
+
+
+@pytest.mark.usefixtures("rail")
+def test_a_device_of_a_package_runs_in_the_time_that_its_data_sheet_allows(
+    call: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, out, err = call("run", "point_mass", "--device", "rail", "--fast", "--duration", "0.1")
+    assert code == 0, err
+    assert "passive, and certified" in out
+    with hb.Bridge("point_mass", "rail", clock=hb.SimulatedClock()) as bridge:
+        bridge.run(duration=0.1)
+    module = sys.modules["hapticbridge_rail"]
+
+    def open_real(options: Mapping[str, object], _notify: Notify) -> Device:
+        device: Device = module.Rail(**options)
+        device.info = replace(device.info, is_real=True)
+        return device
+
+    monkeypatch.setattr(module, "DRIVER", replace(module.DRIVER, open=open_real))
+    code, _, err = call("run", "point_mass", "--device", "rail", "--fast", "--duration", "0.1")
+    assert code == 2
+    assert "the device 'rail' moves in real time" in err
 
 
 @pytest.mark.usefixtures("rail")

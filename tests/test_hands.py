@@ -431,6 +431,21 @@ def test_changed_metadata_of_hands_are_noticed(value: str, message: str, tmp_pat
     assert message in report.reason
 
 
+def test_a_recording_of_hands_with_different_ratios_of_scales_is_refused(tmp_path: Path) -> None:
+    path, forged = tmp_path / "run.mcap", tmp_path / "forged.mcap"
+    recorded(path, seconds=0.1)
+    request = json.loads(hb.read_recording(path, hand=0).meta["request"])
+    request["grasps"][1]["workspace"] = {
+        **request["options"]["workspace"],
+        "scale": 0.2,
+        "force_scale": 1.0,
+    }
+    rewrite(path, forged, lambda ticks: None, request=json.dumps(request))
+    report = hb.audit(forged, in_process=True)
+    assert (report.verdict, report.certified) == ("invalid", None)
+    assert "is 1 for the hand at 'left' and 5 for that at 'right'" in report.reason
+
+
 def rewrite(
     path: Path,
     forged: Path,

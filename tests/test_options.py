@@ -21,7 +21,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.demand.guard import Limits
 from hapticbridge.device import AXES, DeviceInfo, Hand, Motion, SimulatedDevice
-from hapticbridge.errors import CouplingError, HapticBridgeError
+from hapticbridge.errors import CouplingError, DeviceError, HapticBridgeError
 from hapticbridge.kernel.parameters import ENVIRONMENT, GuardParameters, RunParameters
 from hapticbridge.run import options
 from hapticbridge.run.bridge import Bridge
@@ -101,6 +101,14 @@ def test_what_device_clock_and_options_cannot_do_together_is_refused(
 ) -> None:
     with pytest.raises(HapticBridgeError, match=re.escape(message)):
         RunSetup.resolve(scene, info, None, options, clock, is_recorded=False)
+
+
+def test_a_loop_that_a_device_states_and_lacks_is_refused(scene: Scene) -> None:
+    device = SimulatedDevice()
+    Bridge(scene, device, clock=SimulatedClock())
+    device.info = replace(device.info, loop_period=1e-4, loop_delay=1e-5)
+    with pytest.raises(DeviceError, match="'simulated' states loop_period, a loop of its own, but"):
+        Bridge(scene, device, clock=SimulatedClock())
 
 
 def test_a_setup_holds_the_choices_that_were_left_open(scene: Scene) -> None:

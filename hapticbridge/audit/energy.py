@@ -188,8 +188,7 @@ class EnergyBalance:
         unpaid_energy: Energy given to the hand beyond what may have paid for it before the tick,
             (n,) in J (``hand_energy.HandEnergy``); zero without a hand.
         coupling_account: q (W_c + V − V_0) of ``kernel.timing`` after each tick, (n,) in J.
-        springs: Energy at the hand that the coupling's springs held at the start and after each
-            reset, in J.
+        springs: Energy in J that the coupling's springs held at the start and after each reset.
         input_work: Cumulative work of the scene's inputs without that of resets, (n,) in J.
         released: Energy in J that the scene's storage has given to the hand after the last tick.
         contact_tank: Energy that may pay for the depenetration of rigid contacts, (n,) in J; zero
@@ -269,7 +268,7 @@ class EnergyBalance:
         totals |= {"created": created, "taken": np.maximum(spent, 0.0) + coupling_work}
         totals |= {"motors": ticks["actuator_work"], "external": ticks["external_work"]}
         totals |= _released(totals, before, stored - others_work, is_reset)
-        ratio = parameters.force_scale / parameters.scale
+        ratio = parameters.energy_ratio
         net, unpaid = _hand_energies(parameters, totals, before, is_reset)
         held = stored_in_springs(parameters, gains, (motion.stretch, motion.twist))
         held = held - totals["start_springs"]
@@ -293,7 +292,7 @@ class EnergyBalance:
             * parameters.guarding.has_hand,
             unpaid_energy=(unpaid - pulses.paid(before)) * parameters.guarding.has_hand,
             coupling_account=ratio * (coupling_work + held),
-            springs=float(ratio * totals["start_springs"][-1]),
+            springs=float(totals["start_springs"][-1]),
             input_work=totals["inputs"],
             released=float(totals["released"][-1]),
             contact_tank=(ceiling - spent) * (parameters.is_rigid and not parameters.scene_ticks),
@@ -313,7 +312,7 @@ def _device_excess(
     released = totals["coupling_work"] + in_springs
     excess = totals["delayed_device_energy"] - totals["device_dissipation"]
     excess = excess - totals["unfelt_work"] - totals["hidden_energy"]
-    return np.asarray(excess + parameters.force_scale / parameters.scale * (lost + released))
+    return np.asarray(excess + parameters.energy_ratio * (lost + released))
 
 
 def _hand_energies(
@@ -328,7 +327,7 @@ def _hand_energies(
     a reset has put back in stays lost. A device with a loop of its own may have what the scene
     released at any time before.
     """
-    ratio = parameters.force_scale / parameters.scale
+    ratio = parameters.energy_ratio
     stored, taken = (
         np.concatenate([[before[name]], totals[name][:-1]]) for name in ("released", "taken")
     )
@@ -467,7 +466,7 @@ def unfelt_work(
         Work of each tick, (n,) in J; zero for axes that do not move.
     """
     lacking = 1.0 - axes_with_motor(parameters)
-    ratios = parameters.force_scale * parameters.scale, parameters.force_scale / parameters.scale
+    ratios = parameters.force_scale * parameters.scale, parameters.energy_ratio
     work = np.zeros(len(whole))
     for first, ratio, step in zip((0, 3), ratios, motion, strict=True):
         column = 2 * first // 3

@@ -78,7 +78,7 @@ class PulseBalance:
     def of(cls, block: AuditedBlock, events: RunEvents, created: Array) -> PulseBalance:
         """Computes the balance of a block; ``created`` is Σ E_k after each tick, (n,) in J."""
         ticks, parameters, state = block.ticks, events.parameters, block.state
-        n, ratio = len(ticks), parameters.force_scale / parameters.scale
+        n, ratio = len(ticks), parameters.energy_ratio
         if parameters.impact_pulses == 0.0:
             return cls(*(np.zeros(n) for _ in range(8)))
         before, d = state.sums, parameters.pulse_ticks

@@ -134,7 +134,7 @@ class TimingTally:
         uncovered = np.fromiter(islice(sums, 1, None), float, len(steps))
         self.uncovered = float(uncovered[-1])
         if is_behind:
-            ratio = parameters.force_scale / parameters.scale
+            ratio = parameters.energy_ratio
             created = ticks["environment_energy"] + balance.pulses.taken
             uncovered = uncovered + ratio * np.maximum(created, 0.0)
         self.max_uncovered = max(self.max_uncovered, float(np.max(uncovered)))

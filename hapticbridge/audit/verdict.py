@@ -179,6 +179,11 @@ class AuditReport:
         return HandEnergy() if self.certification is None else self.certification.energy
 
     @property
+    def scales(self) -> str:
+        """Clause of hands at which energy counts otherwise than in the scene (``HandEnergy``)."""
+        return next(filter(None, (each.scales for each in self.hand_energies)), "")
+
+    @property
     def reason(self) -> str:
         """The verdict in a sentence, with all remarks."""
         return "; ".join((self.sentence, *self.remarks))
@@ -275,6 +280,7 @@ class PassivityTally:
     """Energies of a recording against their bounds, collected block by block.
 
     Attributes:
+        ratio: q of ``HandEnergy``.
         is_watched: True if the device port is judged by any excess of its energy. A device that
             meets its condition behind a coupling law is judged by unpaid energy alone.
         energies: Energies after the newest tick, in J.
@@ -285,6 +291,7 @@ class PassivityTally:
         excess: First tick in which the device received excess energy, and that energy.
     """
 
+    ratio: float
     is_watched: bool
     energies: dict[str, float] = field(default_factory=dict)
     slack_share: float = 0.0
@@ -320,6 +327,7 @@ class PassivityTally:
             motors=_peak(self.hand_energy.motors, ticks["actuator_work"]),
             inputs=_peak(self.hand_energy.inputs, balance.input_work),
             gross=max(self.hand_energy.gross, float(np.max(balance.gross_energy))),
+            ratio=self.ratio,
         )
         self.energies = {name: float(last[name]) for name in _RECORDED} | {
             "coupling_work": float(balance.coupling_work[-1]),
@@ -477,7 +485,14 @@ def verdict_on(
         fault = file_fault(recording) or first_contradiction(metadata_statements(recordings))
         fault = fault or _hands_fault(hands)
         if fault is None:
-            energies = [PassivityTally(is_watched=not each.is_borne) for each in devices]
+            judged = zip(hands, devices, strict=True)
+            energies = [
+                PassivityTally(
+                    1.0 if hand.run.info.is_prescribed else hand.run.parameters.energy_ratio,
+                    is_watched=not device.is_borne,
+                )
+                for hand, device in judged
+            ]
             with comparison(hands, is_trusted=in_process) as replayed:
                 report, fault = _compared_in_ticks(report, hands, devices, energies)
                 if fault is None:
@@ -506,7 +521,8 @@ def _hand_words(report: AuditReport) -> str:
         if energy.net > INSTANT:
             parts.append(f"net to the hand{at} {energy.sentence}")
         elif energy.release and not report.credit:
-            parts.append(f"the scene's storage{at} {energy.release}")
+            giver = "the scene's storage or another hand" if report.hands else "the scene's storage"
+            parts.append(f"{giver}{at} {energy.release}")
         if energy.blur:
             parts.append(f"encoder steps{at} {energy.blur}")
     return "; ".join(parts)
@@ -694,6 +710,7 @@ def _remarks(report: AuditReport, events: Sequence[Mapping[str, Any]]) -> tuple[
         silence.sentence if silence else "",
         f"the device's loop: {own_loop.words}" if own_loop else "",
         certification.reason if certification else "",
+        report.scales,
         _hand_words(report),
         unusual_end(report.trip, events),
         report.unchecked,

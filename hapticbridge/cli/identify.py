@@ -157,13 +157,21 @@ def print_result(
         out.print(f"next: {plain(f'{command} --device {shlex.quote(device)}')}")
 
 
+_SHEET = (
+    *("mass", "damping", "rotational_inertia", "rotational_damping"),
+    *("friction", "resolution", "delay"),
+)
+"""Numbers of a data sheet that ``identify`` measures."""
+
+
 def _sheet_words(info: DeviceInfo, period: float) -> str:
     """Returns what a device class states of it, and as how many ticks its delay counts."""
-    known = {name: getattr(info, name) for name in ("mass", "damping", "friction", "delay")}
-    listed = ", ".join(f"{name}={each:.4g}" for name, each in known.items() if each is not None)
+    known = {name: getattr(info, name) for name in _SHEET}
+    listed = [f"{name}={each:.6g}" for name, each in known.items() if each is not None]
+    listed += ["is_delay_measured=True"] * info.is_delay_measured
     late = delay_ticks(info, period)
     ticks = "" if late is None else f"; the delay counts as {late} tick{'s' * (late != 1)}"
-    return f"in a class of your own: DeviceInfo({listed}){ticks}"
+    return f"in a class of your own: DeviceInfo({', '.join(listed)}){ticks}"
 
 
 def _if_in_time(info: DeviceInfo, period: float) -> str:

@@ -14,7 +14,12 @@ from hapticbridge.arguments import Arguments, option, shared
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress, write_figure
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
-from hapticbridge.demand.certificate import IF_AT_ONCE, DampingCondition, conditions_of
+from hapticbridge.demand.certificate import (
+    IF_AT_ONCE,
+    DampingCondition,
+    conditions_of,
+    default_coupling,
+)
 from hapticbridge.demand.loop_setting import IN_TIME, Lag, LoopSetting, delay_ticks, pulling_loop
 from hapticbridge.demand.methods import RunCoupling, default_method
 from hapticbridge.demand.plots import (
@@ -234,6 +239,8 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
     if z.delay:
         of = f": it needs at most {NEEDED_SHARE:.0%} of b, in every scene"
     out.print(f"use {sentence}{of}")
+    own_loop = f"--device-damping {z.device_damping:g} --loop-rate HZ --loop-delay SECONDS"
+    out.print(f"a loop on the device's own board bears more: 'hapticbridge bound {own_loop}'")
     if command is None:
         out.print(
             "'hapticbridge run' has no low-pass: leave --filter-time out for a run's coupling"
@@ -286,21 +293,27 @@ def _print_measured(measured: MeasuredWidth) -> None:
         )
 
 
+_COUNTED = "--friction with --resolution counts them"
+
+
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Compute the device damping that a coupling needs.
+    """Compute the device damping that a coupling needs, or the stiffest coupling of a device.
 
-    Alternative laws are listed beside it. K and B are the requested ones; the law of the default
-    method uses B - KT/2, at least 0. Exit code 1 if --device or --device-damping does not suffice.
+    Without --stiffness it is the coupling that 'run' chooses for the device, or for the numbers in
+    its place. Alternative laws are listed beside it. K and B are the requested ones; the law of the
+    default method uses B - KT/2, at least 0. Exit code 1 if --device or --device-damping does not
+    suffice, 0 if it does, or if it cannot be judged because the device's delay is unknown.
 
     Examples:
         hapticbridge bound --stiffness 2000 --damping 1 --rate 1000
         hapticbridge bound --stiffness 2000 --damping 1 --device simulated:damping=3
-        hapticbridge bound --stiffness 15000 --device-damping 2 --loop-rate 1e4 --loop-delay 1e-5
+        hapticbridge bound --device-damping 2 --friction 0.1 --resolution 1e-5 --loop-rate 1e4
+            --loop-delay 1e-5
     """
 
-    stiffness: float = shared(Coupling, "stiffness")
-    """Coupling stiffness K in N/m."""
+    stiffness: float | None = shared(Coupling, "stiffness", None)
+    """Coupling stiffness K in N/m; by default what 'run' chooses for the device."""
     damping: float = shared(Coupling, "damping", 0.0)
     """Requested damping B of the coupling in N s/m."""
     rate: float | None = shared(BridgeOptions, "rate")
@@ -311,6 +324,10 @@ class Bound:
     its driver or its profile ('hapticbridge identify' writes one). It is opened, and not moved."""
     device_damping: float | None = option(None, unit="N s/m", least=0.0, is_open=True)
     """Physical damping b in N s/m of a device without delay, in place of --device."""
+    friction: float | None = shared(DeviceInfo, "friction")
+    """Coulomb friction in N of a device with --device-damping; it holds the encoder's steps."""
+    resolution: float | None = shared(DeviceInfo, "resolution")
+    """Step in m of that device's position; 0 if it has none, by default not counted."""
     loop_rate: float | None = option(None, unit="Hz", least=0.0, is_open=True)
     """Rate of a loop on the device's own board, which then renders the coupling."""
     loop_delay: float | None = option(None, unit="s", least=0.0, is_open=True)
@@ -326,29 +343,30 @@ class Bound:
         info = self._info()
         rate = rate_for(self.rate, info)
         period = period_of(rate)
-        coupling = Coupling(self.stiffness, self.damping, 0.0, 0.0)
+        coupling = self._coupling(info, period)
         if info is not None and info.loop_period is not None:
             return self._judge_own_loop(info, coupling, period)
         filter_time = period if self.filter_time is None else self.filter_time
         ways = alternatives(coupling, period, filter_time)
         shown = RunCoupling.of(default_method(), period, coupling)
-        condition = None if info is None else _condition(info, coupling, period)
-        b = self.device_damping
-        if info is not None and _is_prompt(info, period):
-            b = info.damping
+        condition = None
+        if info is not None and not self._has_open_steps:
+            condition = _condition(info, coupling, period)
+        b = info.damping if info is not None and _is_prompt(info, period) else None
         holds = None if b is None else b >= ways[0].needed
         if condition is not None:
             holds = condition.holds
         if self.as_json:
             facts = _facts(shown, ways, condition, info)
-            largest = self._largest_stiffness(b, period)
+            largest = _largest_stiffness(b, coupling, period)
             print_json(facts | {"holds": holds, "largest_stiffness": largest})
         else:
-            self._print(ways, shown, period, b, info, condition)
+            self._print(ways, coupling, period, b, info, condition)
             if condition is not None and (b is None or condition.steps is not None):
                 out.print(plain(condition.sentence()))
         if self.plot is not None:
-            title = f"K = {self.stiffness:g} N/m, B = {self.damping:g} N s/m at {rate:g} Hz"
+            gains = f"K = {coupling.stiffness:g} N/m, B = {coupling.damping:g} N s/m"
+            title = f"{gains} at {rate:g} Hz"
             write_figure(draw_alternatives(ways, title, b), self.plot)
         return 1 if holds is False else 0
 
@@ -369,7 +387,33 @@ class Bound:
             (sentence,) = shown.sentences()
             out.print(sentence)
             out.print(plain(condition.sentence()))
+            if self._has_open_steps:
+                out.print(f"not judged are the encoder's steps: {_COUNTED}")
         return 1 if condition.holds is False else 0
+
+    def _coupling(self, info: DeviceInfo | None, period: float) -> Coupling:
+        """Returns the given coupling, or the one that a run chooses for the device.
+
+        Raises:
+            HapticBridgeError: Neither a stiffness nor a device is given, or a damping alone.
+        """
+        if self.stiffness is not None:
+            return Coupling(self.stiffness, self.damping, 0.0, 0.0)
+        if info is None or self.damping:
+            raise HapticBridgeError(
+                "bound needs --stiffness, or --device or --device-damping without --damping for "
+                "the stiffest coupling that a device bears"
+            )
+        chosen = default_coupling(info, period)
+        if not self.as_json:
+            out.print("as 'hapticbridge run' chooses it:")
+        return replace(chosen, rotational_stiffness=0.0, rotational_damping=0.0)
+
+    @property
+    def _has_open_steps(self) -> bool:
+        """True if the numbers of a device leave out what its encoder's steps need."""
+        is_open = self.resolution is None or (self.friction is None and self.resolution > 0.0)
+        return self.device_damping is not None and is_open
 
     def _info(self) -> DeviceInfo | None:
         """Returns the device's data sheet, with its profile and its loop; None if none is named.
@@ -377,7 +421,7 @@ class Bound:
         Raises:
             HapticBridgeError: Options exclude each other, or a number that is needed is missing.
         """
-        info = self._opened_info()
+        info = self._known_info()
         if self.loop_rate is None:
             if self.loop_delay is not None:
                 raise HapticBridgeError("--loop-delay without --loop-rate HZ has no effect")
@@ -385,15 +429,6 @@ class Bound:
         if self.loop_delay is None:
             raise HapticBridgeError(
                 "--loop-rate needs --loop-delay, the time in s from reading a position to its force"
-            )
-        if info is None and self.device_damping is not None:
-            info = DeviceInfo(
-                name="device",
-                axes=AXES[:1],
-                damping=self.device_damping,
-                resolution=0.0,
-                force_limit=USUAL_FORCE_LIMIT,
-                delay=0.0,
             )
         if info is None:
             raise HapticBridgeError("--loop-rate goes with --device or --device-damping")
@@ -403,11 +438,26 @@ class Bound:
             )
         return replace(info, loop_period=1.0 / self.loop_rate, loop_delay=self.loop_delay)
 
-    def _opened_info(self) -> DeviceInfo | None:
+    def _known_info(self) -> DeviceInfo | None:
+        """Returns the data sheet of the opened device, or of the numbers in its place."""
+        if self.device_damping is None:
+            if (self.friction, self.resolution) != (None, None):
+                raise HapticBridgeError("--friction and --resolution go with --device-damping")
+        elif self.device is not None:
+            raise HapticBridgeError("--device has a damping of its own: leave --device-damping out")
+        else:
+            return DeviceInfo(
+                name="device",
+                axes=AXES[:1],
+                damping=self.device_damping,
+                friction=self.friction,
+                resolution=self.resolution,
+                force_limit=USUAL_FORCE_LIMIT,
+                delay=0.0,
+                is_delay_measured=True,
+            )
         if self.device is None:
             return None
-        if self.device_damping is not None:
-            raise HapticBridgeError("--device has a damping of its own: leave --device-damping out")
         device = open_device(self.device, notify=notify)
         checked_close(device)()
         info = device.info
@@ -422,23 +472,17 @@ class Bound:
             )
         return info
 
-    def _largest_stiffness(self, b: float | None, period: float) -> float | None:
-        """Returns the largest K that the device bears; None without a device, 0 if none."""
-        if b is None:
-            return None
-        return 2 * b / period if self.damping <= b else 0.0
-
     def _print(
         self,
         ways: tuple[Alternative, ...],
-        shown: RunCoupling,
+        coupling: Coupling,
         period: float,
         b: float | None,
         info: DeviceInfo | None,
         condition: DampingCondition | None,
     ) -> None:
         method = default_method()
-        (sentence,) = shown.sentences()
+        (sentence,) = RunCoupling.of(method, period, coupling).sentences()
         needs = "" if b is None and self.device else "; the device needs b >= KT/2 + B_law"
         out.print(f"{sentence}{needs}")
         table = Table("", "damping needed", "most at", box=None, pad_edge=False)
@@ -449,13 +493,13 @@ class Bound:
             verdict = [] if b is None else ["yes" if b >= way.needed else "no"]
             table.add_row(way.name, amount, _where(way), *verdict)
         out.print(table)
-        least = method.compensated_share * self.stiffness * period
+        least = method.compensated_share * coupling.stiffness * period
         if self.device is None:
             out.print(
                 "a delay of the device is not in it: --device counts it, and 'zwidth --delay' has "
                 "the couplings that it allows"
             )
-        if self.damping < least:
+        if coupling.damping < least:
             out.print(
                 f"method {method.name} cannot show less than B = {least:.4g} N s/m at this "
                 "stiffness and rate"
@@ -465,6 +509,8 @@ class Bound:
         needed = ways[0].needed
         if b >= needed:
             limit = "" if condition is None else condition.clause
+            if self._has_open_steps:
+                limit += f", if its friction holds the encoder's steps: {_COUNTED}"
             if has_steps := condition is not None and condition.holds is False:
                 limit += " but for its encoder's steps"
             out.print(f"device damping {b:g} >= {needed:g} N s/m: passive in any hand{limit}")
@@ -475,33 +521,43 @@ class Bound:
                 f"{at_once}method {method.name} needs the larger of KT/2 and B: any K up to "
                 f"{2 * b / period:g} N/m beside any B up to {b:g} N s/m"
             )
-            command = next_command(self.stiffness, max(self.damping, least), self.rate)
+            command = next_command(coupling.stiffness, max(coupling.damping, least), self.rate)
             if self.device is not None:
                 command += f" --device {shlex.quote(self.device)}"
             out.print(f"next: {plain(command)}")
             return
         out.print(f"device damping {b:g} < {needed:g} N s/m: [red]not passive in any hand[/]")
-        self._print_remedies(b, needed, period, (info and info.rate) or math.inf)
+        _print_remedies(coupling, b, needed, period, (info and info.rate) or math.inf)
 
-    def _print_remedies(self, b: float, needed: float, period: float, max_rate: float) -> None:
-        lag, changes, damper = default_method().compensated_share, [], ""
-        b *= NEEDED_SHARE
-        needed /= NEEDED_SHARE
-        if law_damping(self.stiffness, self.damping, period, lag) > 0:
-            stiffness = min(self.stiffness, 2 * b / period)
-            most = largest_effective_damping(b, stiffness, period, lag)
-            damper = f"lower the damping to {most:.4g} N s/m"
-        if self.stiffness * period > 2 * b:
-            changes.append(f"lower the stiffness to {format_number(2 * b / period)} N/m")
-            if (rate := self.stiffness / (2 * b)) <= max_rate:
-                changes.append(f"raise the rate to {format_number(rate)} Hz")
-        out.print("with 15 % in reserve:")
-        if damper and changes:
-            out.print(f"  {damper}, and {' or '.join(changes)}, or")
-        else:
-            for change in filter(None, (damper, *changes)):
-                out.print(f"  {change}, or")
-        out.print(f"  take a device with {needed:.4g} N s/m")
+
+def _largest_stiffness(b: float | None, coupling: Coupling, period: float) -> float | None:
+    """Returns the largest K that a device bears; None without a device, 0 if none."""
+    if b is None:
+        return None
+    return 2 * b / period if coupling.damping <= b else 0.0
+
+
+def _print_remedies(
+    coupling: Coupling, b: float, needed: float, period: float, max_rate: float
+) -> None:
+    lag, changes, damper = default_method().compensated_share, [], ""
+    b *= NEEDED_SHARE
+    needed /= NEEDED_SHARE
+    if law_damping(coupling.stiffness, coupling.damping, period, lag) > 0:
+        stiffness = min(coupling.stiffness, 2 * b / period)
+        most = largest_effective_damping(b, stiffness, period, lag)
+        damper = f"lower the damping to {most:.4g} N s/m"
+    if coupling.stiffness * period > 2 * b:
+        changes.append(f"lower the stiffness to {format_number(2 * b / period)} N/m")
+        if (rate := coupling.stiffness / (2 * b)) <= max_rate:
+            changes.append(f"raise the rate to {format_number(rate)} Hz")
+    out.print("with 15 % in reserve:")
+    if damper and changes:
+        out.print(f"  {damper}, and {' or '.join(changes)}, or")
+    else:
+        for change in filter(None, (damper, *changes)):
+            out.print(f"  {change}, or")
+    out.print(f"  take a device with {needed:.4g} N s/m")
 
 
 def _condition(info: DeviceInfo, coupling: Coupling, period: float) -> DampingCondition:

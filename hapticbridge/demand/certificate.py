@@ -516,7 +516,7 @@ def run_conditions(
     if info.is_prescribed or not method.has_coupling:
         return ()
     conditions = conditions_of(LoopSetting.of_run(info, parameters, method))
-    guard, ratio = parameters.guarding, parameters.force_scale / parameters.scale
+    guard, ratio = parameters.guarding, parameters.energy_ratio
     is_beside = parameters.scene_ticks > 0 or parameters.is_apart
     is_whole = method.scheme == Scheme.MIDPOINT and guard.has_hand and not is_beside
     if not (is_whole and info.turns and guard.twist_damping == math.inf):

@@ -16,7 +16,7 @@ from hapticbridge.demand.certificate import assumed_damping
 from hapticbridge.demand.loop_setting import IN_TIME, Lag
 from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.device.base import JUMP_MARGIN
-from hapticbridge.device.registry import is_driver
+from hapticbridge.device.registry import DRIVERS
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.jit import direct
@@ -232,14 +232,15 @@ def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
     """Refuses a simulated clock for a device bound to real time.
 
     Such a device has motors, or follows a live hand without end and with a delay. A device string
-    is checked before the device is opened and homed; all hardware is bound to real time.
+    is checked before the device is opened and homed: hardware that this package drives is bound to
+    real time. A device of another package is judged by its data sheet, once it is open.
 
     Raises:
         DeviceError: The device is bound to real time and the clock is simulated.
     """
     if isinstance(device, str):
         name = device.partition(":")[0]
-        is_bound = is_driver(name)
+        is_bound = name in DRIVERS
     else:
         name = device.name
         follows = device.is_prescribed and device.delay != 0.0 and device.duration is None

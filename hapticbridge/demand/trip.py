@@ -194,11 +194,13 @@ class Trip:
             least = max(0.5 * energy.net, INSTANT)
             if created > USUAL_ENERGY:
                 return _FIND_PUMP.format(format_energy(created))
-            if abs(energy.motors) > least:
+            if energy.ratio * abs(energy.motors) > least:
                 most = f" ('{strongest}' pushes most)" if strongest else ""
                 return _LIMIT_MOTORS.format(work_words(energy.motors), most)
-            if abs(energy.inputs) > least:
+            if energy.ratio * abs(energy.inputs) > least:
                 return _LIMIT_INPUTS.format(work_words(energy.inputs))
-            if energy.springs > least:  # a softer spring under the same load holds more
+            if (
+                energy.ratio * energy.springs > least
+            ):  # a softer spring under the same load holds more
                 return _EASE_SPRINGS.format(format_energy(energy.springs))
         return _REMEDIES.get(self.code, "")

@@ -349,8 +349,7 @@ class Device(Protocol):
                     self.velocity += self.period * (pull - 2.0 * self.velocity) / 0.6
                     self.position += self.period * self.velocity
                 self.tick += 1
-                sample["position"][0] = self.position, 0.0, 0.0
-                sample["quaternion"][0] = 1.0, 0.0, 0.0, 0.0
+                sample[0] = (self.position, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0
                 return 0
 
             def write(self, wrench):

@@ -13,7 +13,7 @@ board's side of it.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from hapticbridge.device.base import Device
 
@@ -140,6 +140,7 @@ class BoardSetting(NamedTuple):
     torque_level: float = 0.0
 
 
+@runtime_checkable
 class LoopDevice(Device, Protocol):
     """Device with a loop of its own, whose data sheet has ``loop_period``.
 

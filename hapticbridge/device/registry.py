@@ -197,6 +197,7 @@ def parsed(device: str, text: str, valid: Options, first: str = "") -> dict[str,
         kind = valid[name]
         if kind is Path:
             value, text = text, ""
+            _refuse_options_in_path(name, value, valid)
         else:
             value, _, text = text.partition(",")
         try:
@@ -205,6 +206,23 @@ def parsed(device: str, text: str, valid: Options, first: str = "") -> dict[str,
             number = "a whole number" if kind is int else "a number"
             raise DeviceError(f"{name} is '{value.strip()}'; it must be {number}") from None
     return values
+
+
+def _refuse_options_in_path(name: str, text: str, valid: Options) -> None:
+    """Refuses options after a file's name, to which the text would count, unless it is a file.
+
+    Raises:
+        DeviceError: They follow it.
+    """
+    file, *others = text.split(",")
+    are_options = [each.partition("=")[0].strip() in valid for each in others]
+    if any(are_options) and not os.path.exists(text):  # noqa: PTH110 - a name may be too long
+        first = are_options.index(True)
+        options = ",".join(others[first:])
+        raise DeviceError(
+            f"{name}= must come last, because all text after it is the file's name: write "
+            f"{options},{name}={','.join([file, *others[:first]])}"
+        )
 
 
 def refuse_unknown(device: str, options: Iterable[str], valid: Iterable[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from hapticbridge.units import format_energy
@@ -36,8 +37,9 @@ class HandEnergy:
         E <= q (V_0 − W_c) + W_u
 
     W_c is the coupling's work on the scene, V_0 the energy of the coupling's springs at the start
-    and after each reset, W_u the work of axes without a motor; q = force_scale / scale. What the
-    scene gave through the coupling, −W_c, came from its storage, its motors, its inputs (other
+    and after each reset, W_u the work of axes without a motor; q = force_scale / scale: energy in
+    the scene counts q times at the hand, whether the hand puts it in or gets it. What the scene
+    gave through the coupling, −W_c, came from its storage, its motors, its inputs (other
     hands included), or from nowhere: Σ E_k. What E exceeds the right-hand side by without the
     latter is unpaid, but no more than E.
 
@@ -57,13 +59,15 @@ class HandEnergy:
             for an unknown resolution (``passivity_controller.observe_energy``). ``net`` leaves H
             out, so that the hand may have got 2 H more.
         unpaid: Largest unpaid energy in J.
-        springs: q V_0 in J.
-        scene: R, energy in J that the scene's storage has given to the hand.
+        springs: V_0 in J.
+        scene: R, energy in J that the scene's storage has given through the coupling.
         motors: Work in J that the scene's motors had done when it was largest in size; negative if
             they had taken energy then.
         inputs: Work in J of the scene's inputs, taken in the same way: applied forces and moved
             mocap bodies. Gravity compensation and resets are not counted.
         gross: Largest E − W_u in J.
+        ratio: q. ``springs``, ``scene``, ``motors`` and ``inputs`` are energies in the scene, the
+            others at the hand.
 
     References:
         Brown & Colgate 1997, eq. (6), as an identity over time.
@@ -77,12 +81,25 @@ class HandEnergy:
     motors: float = 0.0
     inputs: float = 0.0
     gross: float = 0.0
+    ratio: float = 1.0
+
+    @property
+    def times(self) -> str:
+        """The ratio q in words, as ``5 times`` before an energy; empty if it is 1."""
+        return "" if math.isclose(self.ratio, 1.0) else f"{self.ratio:.4g} times"
+
+    @property
+    def scales(self) -> str:
+        """Clause on a hand at which energy counts otherwise than in the scene; else empty."""
+        if not self.times:
+            return ""
+        return f"energy of the scene counts {self.times} at the hand: force_scale / scale"
 
     @property
     def _pushing(self) -> tuple[str, ...]:
         """Names of the scene's ports that did work, if they may have paid for over ``INSTANT``."""
-        ports = {"motors": abs(self.motors), "inputs": abs(self.inputs)}
-        paid = self.springs + max(self.unpaid, 0.0)
+        ports = {"motors": self.ratio * abs(self.motors), "inputs": self.ratio * abs(self.inputs)}
+        paid = self.ratio * self.springs + max(self.unpaid, 0.0)
         if max(self.gross, self.net) - paid <= INSTANT:
             return ()
         least = INSTANT
@@ -106,8 +123,12 @@ class HandEnergy:
             f"the hand got {format_energy(self.unpaid)} beyond what it put in, what the device's "
             f"damping burned, and what was released: by the scene {format_energy(self.scene)}, by "
             f"the coupling's springs {format_energy(self.springs)}, by motors "
-            f"{format_energy(self.motors)}, by inputs {format_energy(self.inputs)}"
+            f"{format_energy(self.motors)}, by inputs {format_energy(self.inputs)}{self._counted}"
         )
+
+    @property
+    def _counted(self) -> str:
+        return f", which count {self.times}" if self.times else ""
 
     @property
     def blur(self) -> str:
@@ -119,24 +140,29 @@ class HandEnergy:
     @property
     def release(self) -> str:
         """Clause on the energy from the scene's storage; empty below ``RELEASE``."""
-        if self.scene <= RELEASE:
+        if self.ratio * self.scene <= RELEASE:
             return ""
+        given = format_energy(self.ratio * self.scene)
+        if self.times:
+            released = format_energy(self.scene)
+            given = f"up to {given}, {self.times} the {released} that it released"
         return (
-            f"gave the hand {format_energy(self.scene)}, as weights that sink, springs and bodies "
-            "that slow down do; the energy limit leaves it out"
+            f"gave the hand {given}, as weights that sink, springs and bodies that slow down do; "
+            "the energy limit leaves it out"
         )
 
     @property
     def sentence(self) -> str:
         """Net energy and its origin, as far as it is known."""
         beyond = ["what it put in"]
-        if self.scene > INSTANT:
-            beyond.append(f"the {format_energy(self.scene)} that the scene released")
+        if self.ratio * self.scene > INSTANT:
+            released = f"the {format_energy(self.scene)} that the scene released"
+            beyond.append(f"{self.times} {released}" if self.times else released)
         works = {"motors": self.motors, "inputs": self.inputs}
         origins = [f"the scene's {name} {work_words(works[name])}" for name in self._pushing]
         if origins:
             origins[-1] += f", and {_BOUND}"
-        if self.springs > INSTANT:
+        if self.ratio * self.springs > INSTANT:
             springs = format_energy(self.springs)
             origins.append(f"the coupling's springs held {springs} at the start or after resets")
         if self.fault and self.unpaid > self.hidden:

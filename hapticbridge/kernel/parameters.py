@@ -394,11 +394,13 @@ class RunParameters(StepTimes):
         return min(whole_ticks(self.guarding.stated_delay + self.pulse_lag, self.period), SENT - 2)
 
     @property
-    def tank_at_start(self) -> float:
-        """Energy in J in front of another program's scene, at the tool; ``credit`` is at the hand.
+    def energy_ratio(self) -> float:
+        """Energy at the hand per energy in the scene, q = force_scale / scale."""
+        return self.force_scale / self.scale
 
-        Whatever the tool gets or gives is force_scale/scale times as much at the hand.
-        """
+    @property
+    def tank_at_start(self) -> float:
+        """Energy in J in front of another program's scene; unlike ``credit``, at the tool."""
         return self.credit * self.scale / self.force_scale
 
     @property

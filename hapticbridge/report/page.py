@@ -203,6 +203,8 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
             facts.append(("time kept", certification.kept.remark))
         if certification.own_loop:
             facts.append(("device's loop", certification.own_loop.words))
+    if report.scales:
+        facts.append(("scales", report.scales))
     if report.slack_share:
         facts.append(("slack used", format_share(report.slack_share)))
     return [*facts, ("simulated again", report.resimulation or "not reached")]

@@ -215,7 +215,7 @@ class Endpoint:
         assert session.posted is not None  # the scene is that of ``posted_scene``
         self._scene, parameters = session.posted, session.parameters
         self._scene_period = parameters.scene_period
-        self._ratio = parameters.force_scale / parameters.scale
+        self._ratio = parameters.energy_ratio
         self._is_absolute = bridge.setup.workspace.absolute
         self._told["period"], coupling = parameters.period, bridge.setup.coupling
         self._told["gains"] = (

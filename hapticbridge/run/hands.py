@@ -33,10 +33,11 @@ from hapticbridge.scene import Scene, load_scene
 class GripAxis:
     """Joint of the scene that a device's grip axis moves.
 
-        q = q_0 + scale · (x − x_0),    F = −scale · f
+        y = y_0 + scale · (x − x_0),    F = −q · scale · f
 
-    q is the joint's handle in m or rad, x how far the grip is closed in m, f the coupling's force
-    or torque on the joint, F the force on the fingers in N.
+    y is the joint's handle in m or rad, x how far the grip is closed in m, f the coupling's force
+    or torque on the joint, F the force on the fingers in N; q = force_scale / scale of the hand, so
+    that energy counts alike for all of it.
 
     Attributes:
         joint: Hinge or slide of the scene that the device's grip axis moves, as the jaw of pliers.
@@ -61,12 +62,13 @@ class GripAxis:
         if self.scale == 0.0:
             raise HapticBridgeError("scale is 0.0; it must be finite and not 0")
 
-    def workspace(self, scene: Scene, info: DeviceInfo) -> Workspace:
+    def workspace(self, scene: Scene, info: DeviceInfo, hand: Workspace) -> Workspace:
         """Returns the map from the grip to the joint.
 
         Args:
             scene: The scene as the grip axis holds it.
             info: The axis' data sheet.
+            hand: Map of the hand whose fingers close it.
 
         Raises:
             SceneError: The scale is not named, and the travel or the joint's range is unknown.
@@ -80,7 +82,9 @@ class GripAxis:
                     "name the joint's motion per m of the grip (--grip-scale)"
                 )
             scale = float(high - low) / info.reach
-        return Workspace(scale=abs(scale), axes=_SAME if scale > 0 else _REVERSED)
+        size, axes = abs(scale), _SAME if scale > 0 else _REVERSED
+        ratio = hand.energy_ratio
+        return Workspace(scale=size, force_scale=None if ratio == 1.0 else ratio * size, axes=axes)
 
 
 _SAME, _REVERSED = np.eye(3), np.diag([-1.0, 1.0, -1.0])
@@ -234,10 +238,43 @@ def resolve_hands(
             info.grip_axis,
             replace(own.limits, reach=math.inf, force=math.inf, torque=math.inf),
         )
-        workspace = grasp.grip_axis.workspace(scene.of_hand(len(setups)), axis)
+        workspace = grasp.grip_axis.workspace(scene.of_hand(len(setups)), axis, workspace)
         own = replace(own, workspace=workspace, limits=limits)
         resolve(axis, grasp.grip_axis.coupling, own)
+    _refuse_unequal_energies(setups)
     return tuple(setups)
+
+
+_EQUAL = 1e-9
+"""Largest relative difference of two equal ratios of scales, from rounding. A hand that goes round
+between two handles could gain this share of what it moves, which any damping burns."""
+
+
+def _refuse_unequal_energies(setups: Sequence[RunSetup]) -> None:
+    """Refuses hands between which energy would be multiplied.
+
+    With q_i = force_scale / scale of hand i, the work W_i of its coupling on the scene, the energy
+    V_i of its springs at the start and the scene's storage S_0, in J,
+
+        E_i <= q_i (V_i − W_i),    Σ W_i >= −S_0,    so    Σ E_i <= q (Σ V_i + S_0)
+
+    for one q alone: E_i is what hand i gets beyond what it puts in. With two, a bar that joins the
+    handles gains (q_2/q_1 − 1) of what it carries across. A prescribed motion feels no force, so it
+    gets nothing, and its q is free.
+
+    Raises:
+        HapticBridgeError: The ratios of two hands differ.
+    """
+    felt = [(each.scene.grip, each.workspace) for each in setups if not each.info.is_prescribed]
+    for grip, workspace in felt[1:]:
+        (first, others), own = felt[0], workspace.energy_ratio
+        if not math.isclose(own, others.energy_ratio, rel_tol=_EQUAL):
+            alike = others.energy_ratio * workspace.scale
+            raise HapticBridgeError(
+                f"force_scale / scale is {others.energy_ratio:.4g} for the hand at '{first}' and "
+                f"{own:.4g} for that at '{grip}': what one puts in would come out at the other "
+                f"multiplied; let them be equal, as with force_scale {alike:.4g} at '{grip}'"
+            )
 
 
 def _workspace_of_joint(grasp: Grasp, options: BridgeOptions) -> Workspace:

@@ -40,6 +40,7 @@ from hapticbridge.demand.methods import (
 )
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.base import calling_on_error
+from hapticbridge.device.own_loop import LoopDevice
 from hapticbridge.device.simulated.dynamics import DEFAULT_HAND
 from hapticbridge.errors import (
     DeviceError,
@@ -112,6 +113,12 @@ class Workspace:
     def scales(self) -> tuple[float, float]:
         """Scales of motion and of force."""
         return self.scale, self.scale if self.force_scale is None else self.force_scale
+
+    @property
+    def energy_ratio(self) -> float:
+        """Energy at the device per energy in the scene, q = force_scale / scale."""
+        scale, force_scale = self.scales
+        return force_scale / scale
 
     @property
     def rotation(self) -> tuple[float, ...]:
@@ -375,7 +382,7 @@ def device_for_run(
 
     Raises:
         DeviceError: The device cannot be opened, is no device, or is bound to real time and the
-            clock is simulated.
+            clock is simulated, or states a loop of its own that it lacks.
     """
     if not isinstance(device, str):
         if not isinstance(getattr(device, "info", None), DeviceInfo):
@@ -383,12 +390,29 @@ def device_for_run(
                 f"device is {shown(device)}; it must be a string such as 'simulated', or an object "
                 "with the calls of hapticbridge.Device and its data sheet 'info'"
             )
+        _refuse_missing_loop(device)
         yield device
         return
     refuse_simulated_time(device, clock)
     opened = device_for(scene, device, grip_axis=grip_axis)
     with calling_on_error(opened.close):
+        _refuse_missing_loop(opened)
         yield opened
+
+
+def _refuse_missing_loop(device: Device) -> None:
+    """Refuses a device that states a loop of its own and has no calls to run one.
+
+    Raises:
+        DeviceError: It does.
+    """
+    if device.info.loop_period is not None and not isinstance(device, LoopDevice):
+        raise DeviceError(
+            f"the device '{device.info.name}' states loop_period, a loop of its own, but lacks the "
+            "calls of hapticbridge.device.own_loop.LoopDevice to show it a tool: leave out "
+            "loop_period and loop_delay ('hapticbridge bound --loop-rate' judges a coupling on "
+            "such a board)"
+        )
 
 
 def _usual_coupling(

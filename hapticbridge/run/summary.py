@@ -198,14 +198,19 @@ WELD = "the weld in its stiffest directions at the start"
 _NAME_WIDTH = 20
 """Characters of a row's name in the text of a summary, with the space after it."""
 
+_STORAGE = "scene's storage"
+"""Row of the text on the energy that the scene has given to a hand."""
+
 _OF_A_HAND = (
     "probe",
     "silence",
     "peak",
     "reach",
+    "scales",
     "coupling work",
     "device energy",
     "net to the hand",
+    _STORAGE,
     "slack",
 )
 """Rows of the text of a summary that each of several hands has of its own."""
@@ -354,9 +359,10 @@ class Summary:
             more = f", and {format_energy(self.credit)}" if self.credit else ""
             more += self.certification.provisos
             more += ", apart from what motors and inputs gave" if self.hand_energy.limit else ""
+            times = f"{self.hand_energy.times} what " if self.hand_energy.times else ""
             return (
                 "passive, and certified: on the device as stated no hand gets more than it puts in "
-                f"or the scene had stored{more}"
+                f"or {times}the scene had stored{more}"
             )
         judged = "not certified" if self.is_certified is False else "not judged"
         return f"the scene was passive, the device is {judged}: a hand may get energy out of it"
@@ -384,8 +390,9 @@ class Summary:
             for name, text in each._rows():
                 is_got = name == "device energy" and each.energies["device_energy"] > INSTANT
                 origin = ", put in by other hands" if is_got and not each.max_net_energy else ""
+                shown = "scene, other hands" if name == _STORAGE else name
                 if name in _OF_A_HAND:
-                    yield f"  {name:<{_NAME_WIDTH - 2}}{text}{origin}"
+                    yield f"  {shown:<{_NAME_WIDTH - 2}}{text}{origin}"
             yield from (f"  {line}" for line in (*each._coupling_lines(), *each._device_lines()))
         yield from self._last_lines()
 
@@ -443,6 +450,8 @@ class Summary:
             yield "pulses", f"paid {format_energy(paid)} by blows; they {work_words(worked)}"
         if self.reach is not None:
             yield "reach", f"{format_si(self.reach, 'm')}; beyond, no handle and no force"
+        if scales := self.hand_energy.scales:
+            yield "scales", scales
         for name, text in energy_rows(self.energies, self.start_potential, self.credit):
             remark = ", what the program may still give to the hand" if name == "tank" else ""
             if name == "device energy" and not self.has_hand:
@@ -452,7 +461,7 @@ class Summary:
         if self.max_net_energy > INSTANT:
             yield "net to the hand", so_far + self.hand_energy.sentence
         elif not self.credit and (release := self.hand_energy.release):
-            yield "scene's storage", release
+            yield _STORAGE, release
         if blur := self.hand_energy.blur:
             yield "encoder steps", so_far + blur
 
@@ -595,14 +604,14 @@ def _fault(
 def hand_energy(state: NDArray[np.void], parameters: RunParameters) -> HandEnergy:
     """Reads the energy of a hand from the kernel's state."""
     observer = state["observer"][0]
-    ratio = parameters.force_scale / parameters.scale
     return HandEnergy(
         net=float(observer["max_guarded_energy"]),
         hidden=float(observer["hidden_energy"]),
         unpaid=float(observer["max_unpaid_energy"]),
-        springs=ratio * float(observer["springs"]),
+        springs=float(observer["springs"]),
         scene=float(observer["released"]),
         motors=float(observer["peak_motor_work"]),
         inputs=float(observer["peak_input_work"]),
         gross=float(observer["max_hand_energy"]),
+        ratio=parameters.energy_ratio,
     )

@@ -167,10 +167,11 @@ def _changed_axis(axis: GripAxis, run: RecordedRun, own: Settings) -> GripAxis:
     Raises:
         RecordingError: It is to have a force scale of its own.
     """
-    scale, force_scale = own.options.workspace.scales
-    if force_scale != scale:
+    workspace, before = own.options.workspace, run.settings.options.workspace
+    if workspace.force_scale not in (None, before.force_scale):
         raise RecordingError(
-            f"force_scale of the grip axis at '{run.parameters.grip}' is its scale; change scale"
+            f"force_scale of the grip axis at '{run.parameters.grip}' follows its scale and its "
+            "hand's; change scale"
         )
-    scale = math.copysign(scale, run.setup.workspace.rotation[0])
+    scale = math.copysign(workspace.scale, run.setup.workspace.rotation[0])
     return replace(axis, coupling=own.coupling, scale=scale)
