@@ -290,7 +290,7 @@ class EnergyBalance:
             hidden_energy=float(totals["hidden_energy"][-1]) * parameters.guarding.has_hand,
             gross_energy=(totals["hand_energy"] - totals["unfelt_work"])
             * parameters.guarding.has_hand,
-            unpaid_energy=(unpaid - pulses.paid(before)) * parameters.guarding.has_hand,
+            unpaid_energy=(unpaid - pulses.paid(before, parameters)) * parameters.guarding.has_hand,
             coupling_account=ratio * (coupling_work + held),
             springs=float(totals["start_springs"][-1]),
             input_work=totals["inputs"],

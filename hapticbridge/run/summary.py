@@ -585,7 +585,10 @@ class Summary:
             probe=outcome.probed.words if outcome.probed else "",
             grip=parameters.grip,
             device=info.name,
-            pulses=(float(state["impact"]["earned"][0]), float(state["impact"]["work"][0]))
+            pulses=(
+                parameters.force_scale / parameters.scale * float(state["impact"]["taken"][0]),
+                float(state["impact"]["work"][0]),
+            )
             if parameters.impact_pulses
             else None,
         )
