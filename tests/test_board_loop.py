@@ -210,9 +210,7 @@ def twist_of(first: Any, second: Any) -> float:
     return float(np.linalg.norm(rotation_between(tuple(first), tuple(second))))
 
 
-@pytest.mark.parametrize(
-    ("seed", "twist"), [*((seed, 0.0) for seed in range(4)), (4, 3e-4), (5, 0.1)]
-)
+@pytest.mark.parametrize(("seed", "twist"), [(0, 0.0), (1, 0.0), (4, 3e-4), (5, 0.1)])
 def test_each_period_is_that_of_the_kernel(library: ctypes.CDLL, seed: int, twist: float) -> None:
     """Twists of ``twist`` rad: without any, small ones, and some of more than half a radian."""
     turns = twist > 0.0
@@ -289,7 +287,7 @@ def test_no_hand_gets_more_than_the_credit(library: ctypes.CDLL, loop: str) -> N
 def test_without_tank_or_damping_hands_are_seen_to_gain(
     library: ctypes.CDLL, change: dict[str, Any], loop: str
 ) -> None:
-    assert max(gained(library, seed, **ATTACKS[loop], **change) for seed in range(100)) > 0.01
+    assert any(gained(library, seed, **ATTACKS[loop], **change) > 0.01 for seed in range(100))
 
 
 def wobbling(library: ctypes.CDLL, **changes: float) -> tuple[float, float]:

@@ -45,7 +45,7 @@ def test_no_hand_gets_energy_out_of_a_slower_scene(ticks: int) -> None:
 
 
 def test_results_that_nobody_pays_for_are_seen_to_give_energy() -> None:
-    assert max(attack(seed, 20, pays=False) for seed in range(60)) > 0.1
+    assert any(attack(seed, 20, pays=False) > 0.1 for seed in range(60))
 
 
 def rms(values: NDArray[np.float64]) -> float:

@@ -51,7 +51,7 @@ def test_a_tool_that_turns_past_half_a_turn_gives_nothing() -> None:
 
 
 def test_a_program_that_nobody_pays_for_is_seen_to_give_joules() -> None:
-    assert max(attack(seed, pays=False) for seed in range(60)) > 1.0
+    assert any(attack(seed, pays=False) > 1.0 for seed in range(60))
 
 
 def post_of(position: Any, quaternion: Any = UPRIGHT, **values: Any) -> NDArray[np.void]:
