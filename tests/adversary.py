@@ -214,7 +214,8 @@ def _attack(
     per step of the scene.
     """
     state, sample, normals = states[0], np.zeros(1, SAMPLE_DTYPE), np.zeros(6)
-    kind, late, scene_ticks = int(habits[1]), habits[12], int(habits[13])
+    # a float of NumPy would make numba compile the tick anew: that takes a minute
+    kind, late, scene_ticks = int(habits[1]), float(habits[12]), int(habits[13])
     period, cycle = float(state[0]["run"]["period"]), int(habits[9:12].sum())
     move = direct(_move_device, state, sample, hand, habits, normals, period)
     account = direct(_account, state, hand)
