@@ -450,6 +450,9 @@ class Summary:
             yield "pulses", f"paid {format_energy(paid)} by blows; they {work_words(worked)}"
         if self.reach is not None:
             yield "reach", f"{format_si(self.reach, 'm')}; beyond, no handle and no force"
+        yield from self._energy_rows()
+
+    def _energy_rows(self) -> Iterator[tuple[str, str]]:
         if scales := self.hand_energy.scales:
             yield "scales", scales
         for name, text in energy_rows(self.energies, self.start_potential, self.credit):
