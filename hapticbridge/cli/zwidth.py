@@ -240,7 +240,9 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
         of = f": it needs at most {NEEDED_SHARE:.0%} of b, in every scene"
     out.print(f"use {sentence}{of}")
     own_loop = f"--device-damping {z.device_damping:g} --loop-rate HZ --loop-delay SECONDS"
-    out.print(f"a faster loop on the device's own board bears more: 'hapticbridge bound {own_loop}'")
+    out.print(
+        f"a faster loop on the device's own board bears more: 'hapticbridge bound {own_loop}'"
+    )
     if command is None:
         out.print(
             "'hapticbridge run' has no low-pass: leave --filter-time out for a run's coupling"
