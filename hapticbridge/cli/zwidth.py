@@ -310,8 +310,8 @@ class Bound:
     Examples:
         hapticbridge bound --stiffness 2000 --damping 1 --rate 1000
         hapticbridge bound --stiffness 2000 --damping 1 --device simulated:damping=3
-        hapticbridge bound --device-damping 2 --friction 0.1 --resolution 1e-5 --loop-rate 1e4
-            --loop-delay 1e-5
+        hapticbridge bound --device-damping 2 --friction 0.1 --resolution 1e-5
+        hapticbridge bound --device-damping 2 --loop-rate 1e4 --loop-delay 1e-5
     """
 
     stiffness: float | None = shared(Coupling, "stiffness", None)
