@@ -219,6 +219,18 @@ def test_a_hand_gets_the_ratio_times_what_the_scene_had_stored_and_the_run_says_
     assert got[5.0] > 2.0 * STORED > 2.0 * got[1.0]
 
 
+def test_what_another_hand_put_in_is_not_told_as_the_scenes_storage(tmp_path: Path) -> None:
+    scene, path = scene_at(tmp_path, SLIDER.format(spring="")), tmp_path / "run.mcap"
+    hands = [Grasp("left", End(Bar(1.0, push=5.0))), Grasp("right", End(Bar(1.0, brake=20.0)))]
+    with hb.Bridge(scene, hands, clock=hb.SimulatedClock(), recording=path) as bridge:
+        summary = bridge.run(0.3)
+    shared, _, right = str(summary).partition("hand at 'right'")
+    assert "gave the hand" not in shared
+    assert re.search(r"\n  scene and hands +gave the hand \d+(\.\d+)? mJ", right)
+    told = "the scene's storage or another hand at 'right' gave the hand"
+    assert told in hb.audit(path, in_process=True).reason
+
+
 def test_the_works_of_ports_count_as_the_hand_gets_them() -> None:
     pushed = {"gross": 2.5e-3, "motors": 0.6e-3}
     assert HandEnergy(**pushed, ratio=5.0).limit.startswith("motors of")
