@@ -300,7 +300,7 @@ _COUNTED = "--friction with --resolution counts them"
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Compute the device damping that a coupling needs, or the stiffest coupling of a device.
+    """Compute the device damping that a coupling needs.
 
     Without --stiffness it is the coupling that 'run' chooses for the device, or for the numbers in
     its place. Alternative laws are listed beside it. K and B are the requested ones; the law of the
