@@ -36,12 +36,12 @@ def format_number(value: float, digits: int = 4) -> str:
     return f"{float(f'{value:.{digits}g}'):.15g}"
 
 
-def format_forces(hand: float | None, tool: float, unit: str = "N") -> str:
-    """Names whose a force or torque is: ``1.7 N on the hand, 5.67 N on the tool``.
+def format_forces(hand: float | None, tool: float) -> str:
+    """Names whose a force is: ``1.7 N on the hand, 5.67 N on the tool``.
 
     ``hand`` is None without a hand that feels it. Equal numbers are written once, as the hand's.
     """
-    return format_wrenches(None if hand is None else (hand,), (tool,), (unit,))
+    return format_wrenches(None if hand is None else (hand,), (tool,), ("N",))
 
 
 def format_wrenches(

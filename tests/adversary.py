@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from posting_program import PostingProgram
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.demand.methods import method_named, prepare
+from hapticbridge.demand.methods import method_named, unguarded_parameters
 from hapticbridge.kernel.codes import BAD_RESULT, CLUTCHED, FORCE_OFF, OK
 from hapticbridge.kernel.jit import compiled, direct
-from hapticbridge.kernel.parameters import GuardParameters, RunParameters
+from hapticbridge.kernel.parameters import GuardParameters
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import posted_tick, shown_tick, whole_tick
@@ -214,7 +214,8 @@ def _attack(
     per step of the scene.
     """
     state, sample, normals = states[0], np.zeros(1, SAMPLE_DTYPE), np.zeros(6)
-    kind, late, scene_ticks = int(habits[1]), habits[12], int(habits[13])
+    # a float of NumPy would make numba compile the tick anew: that takes a minute
+    kind, late, scene_ticks = int(habits[1]), float(habits[12]), int(habits[13])
     period, cycle = float(state[0]["run"]["period"]), int(habits[9:12].sum())
     move = direct(_move_device, state, sample, hand, habits, normals, period)
     account = direct(_account, state, hand)
@@ -317,23 +318,14 @@ class Attack:
         values: dict[str, Any] = {"mass": mass} if self.scene in HEAVY else {}
         scene = posted_scene(credit) if self.is_posted else load_scene(self.scene, **values)
         step = period * max(self.scene_ticks, 1)
-        prepare(scene, strongest, step, 1, method, warns=False)
-        start = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-        parameters = RunParameters(
-            grip=scene.grip,
+        parameters = replace(
+            unguarded_parameters(scene, strongest, step, 1, method),
             period=period,
-            substeps=1,
-            coupling=method.law_coupling(strongest, step),
             scale=self.scale,
             force_scale=self.force_scale,
             force_limit=1e9 if self.is_limited_alone else limits[0],
             torque_limit=1e9 if self.is_limited_alone else limits[1],
             ramp_ticks=round(0.1 / period),
-            device_origin=start,
-            handle_origin=scene.grip_pose(),
-            device_start=start,
-            scheme=method.scheme,
-            is_rigid=method.is_rigid,
             device_damping=b,
             device_rotational_damping=b_r,
             **pulses,

@@ -128,6 +128,21 @@ def turns(quaternions: Array, start: Array) -> Array:
     return np.asarray((rotation(quaternions) * rotation(before).inv()).as_rotvec())
 
 
+PLAIN = RunParameters(
+    grip="grip",
+    period=T,
+    substeps=1,
+    coupling=DEFAULT,
+    force_limit=1e9,
+    torque_limit=1e9,
+    ramp_ticks=0,
+    device_origin=IDENTITY,
+    handle_origin=IDENTITY,
+    device_start=IDENTITY,
+)
+"""Parameters of a run without force limits or ramp."""
+
+
 def unlimited(
     scene: Scene,
     coupling: Coupling,
@@ -137,20 +152,17 @@ def unlimited(
     **changes: Any,
 ) -> RunParameters:
     """Returns the parameters of a run from where the scene stands, without force limits or ramp."""
-    parameters = RunParameters(
-        grip=scene.grip,
-        period=period,
-        substeps=substeps,
-        coupling=coupling,
-        force_limit=1e9,
-        torque_limit=1e9,
-        ramp_ticks=0,
-        device_origin=device_start,
-        handle_origin=scene.grip_pose(),
-        device_start=device_start,
-        is_rigid=has_rigid_contact(scene.model),
-    )
-    return replace(parameters, **changes)
+    own: dict[str, Any] = {
+        "grip": scene.grip,
+        "period": period,
+        "substeps": substeps,
+        "coupling": coupling,
+        "device_origin": device_start,
+        "handle_origin": scene.grip_pose(),
+        "device_start": device_start,
+        "is_rigid": has_rigid_contact(scene.model),
+    }
+    return replace(PLAIN, **(own | changes))
 
 
 def bind(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, balance_of, recorded
+from kernel_runs import PLAIN, T
 from random_hands import random_motion
 
 from hapticbridge.audit import audit
@@ -22,19 +23,9 @@ from hapticbridge.recording import read_recording
 from hapticbridge.run.description import parameters_of
 from hapticbridge.run.options import Workspace
 
-T = 1e-3
-HOME = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-RUN = RunParameters(
-    grip="grip",
-    period=T,
-    substeps=1,
+RUN = replace(
+    PLAIN,
     coupling=Coupling(2000.0, 0.5, 2.0, 5e-4),
-    force_limit=1e9,
-    torque_limit=1e9,
-    ramp_ticks=0,
-    device_origin=HOME,
-    handle_origin=HOME,
-    device_start=HOME,
     device_damping=1.5,
     device_rotational_damping=1.5e-3,
 )

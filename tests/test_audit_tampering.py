@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import pytest
 from audit_cases import COMPONENTS, other_request, other_sheet, rewritten, verdict_of, without_model
-from golden_cases import LISTS, NUMBERS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -24,6 +23,26 @@ from hapticbridge.run.description import (
 )
 
 DEVICE_POSE = ("device_position", "device_quaternion")
+
+NUMBERS = [
+    "stiffness",
+    "damping",
+    "rotational_stiffness",
+    "rotational_damping",
+    "period_s",
+    "scale",
+    "force_scale",
+    "force_limit",
+    "torque_limit",
+    "substeps",
+    "ramp_ticks",
+    "start_kinetic",
+    "start_potential",
+]
+"""Metadata that are a number."""
+
+LISTS = ("axes", "device_origin", "handle_origin", "device_start", "handle_start", "tool_start")
+"""Metadata that are a list of numbers."""
 
 
 # A device pose matters only as far as it moves the handle. The handle's coordinates reach 0.05 m,

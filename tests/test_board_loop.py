@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.cli.guide import page
 from hapticbridge.coupling import Coupling
-from hapticbridge.demand.methods import method_named, prepare
+from hapticbridge.demand.methods import method_named, unguarded_parameters
 from hapticbridge.device.own_loop import (
     SURFACES,
     BoardSetting,
@@ -38,7 +39,7 @@ from hapticbridge.device.rawhid.protocol import (
     setting_frame,
     show_frames,
 )
-from hapticbridge.kernel.parameters import GuardParameters, RunParameters
+from hapticbridge.kernel.parameters import GuardParameters
 from hapticbridge.kernel.pose import (
     Quaternion,
     canonical,
@@ -143,28 +144,16 @@ def kernel(*, turns: bool) -> BoundKernel:
     scene, method = posted_scene(CREDIT), method_named("implicit")
     turn = (ROTATIONAL_STIFFNESS, ROTATIONAL_DAMPING) if turns else (1e-6, 0.0)
     coupling = Coupling(STIFFNESS, DAMPING, *turn)
-    prepare(scene, coupling, PERIOD, 1, method, warns=False)
-    start = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-    return BoundKernel(
-        scene.model,
-        scene.data,
-        RunParameters(
-            grip=scene.grip,
-            period=PERIOD,
-            substeps=1,
-            coupling=method.law_coupling(coupling, PERIOD),
-            force_limit=LEVEL,
-            torque_limit=TORQUE_LEVEL,
-            ramp_ticks=1,
-            device_origin=start,
-            handle_origin=scene.grip_pose(),
-            device_start=start,
-            scheme=method.scheme,
-            scene_ticks=20,
-            credit=CREDIT,
-            guarding=GuardParameters(fade_ticks=1),
-        ),
+    parameters = replace(
+        unguarded_parameters(scene, coupling, PERIOD, 1, method),
+        force_limit=LEVEL,
+        torque_limit=TORQUE_LEVEL,
+        ramp_ticks=1,
+        scene_ticks=20,
+        credit=CREDIT,
+        guarding=GuardParameters(fade_ticks=1),
     )
+    return BoundKernel(scene.model, scene.data, parameters)
 
 
 def shown_at_random(
@@ -210,11 +199,17 @@ def twist_of(first: Any, second: Any) -> float:
     return float(np.linalg.norm(rotation_between(tuple(first), tuple(second))))
 
 
-@pytest.mark.parametrize(
-    ("seed", "twist"), [*((seed, 0.0) for seed in range(4)), (4, 3e-4), (5, 0.1)]
-)
+def turn_rounding(turned: float, tool: Any, handle: Any) -> float:
+    """Returns by how much in J the P of a tool's turn in rad may differ."""
+    if turned**2 + twist_of(tool, handle) ** 2 > 0.26:
+        return TORQUE_LEVEL * 2e-6
+    # there the board takes a twist for a length
+    return TORQUE_LEVEL * 2e-6 + 0.01 * min(ROTATIONAL_STIFFNESS * turned, TORQUE_LEVEL) * turned
+
+
+@pytest.mark.parametrize(("seed", "twist"), [(0, 0.0), (1, 0.0), (4, 3e-4), (5, 0.1), (6, 2.0)])
 def test_each_period_is_that_of_the_kernel(library: ctypes.CDLL, seed: int, twist: float) -> None:
-    """Twists of ``twist`` rad: without any, small ones, and some of more than half a radian."""
+    """Twists of ``twist`` rad: without any, small ones, some of half a radian, and of any size."""
     turns = twist > 0.0
     rng, bound = np.random.default_rng(seed), kernel(turns=turns)
     state, row, sample = bound.state, bound.row, np.zeros(1, SAMPLE_DTYPE)
@@ -248,8 +243,6 @@ def test_each_period_is_that_of_the_kernel(library: ctypes.CDLL, seed: int, twis
         wrench = loop.tick(hand, turn)
         if tick <= 5:
             continue
-        if twist_of(row["tool_quaternion"][0], turn) + twist_of(last, turn) > 0.3:
-            continue  # about a large twist the board counts less
         is_paid = int(state["shown"]["held_back"][0]) == held_back
         kinds[int(is_paid)] += 1
         given = float(state["shown"]["work"][0])
@@ -259,7 +252,7 @@ def test_each_period_is_that_of_the_kernel(library: ctypes.CDLL, seed: int, twis
             assert loop.tool == pytest.approx(row["tool_position"][0], abs=5e-8)
             rounding = LEVEL * 2e-8
             if turns:
-                rounding += TORQUE_LEVEL * 2e-6
+                rounding += turn_rounding(twist_of(last, loop.tool_turn), loop.tool_turn, turn)
                 assert wrench[3:] == pytest.approx(sent[3:], abs=1e-5)
                 assert twist_of(row["tool_quaternion"][0], loop.tool_turn) < 1e-6
             assert loop.passed - before == pytest.approx(given, abs=rounding)
@@ -289,7 +282,7 @@ def test_no_hand_gets_more_than_the_credit(library: ctypes.CDLL, loop: str) -> N
 def test_without_tank_or_damping_hands_are_seen_to_gain(
     library: ctypes.CDLL, change: dict[str, Any], loop: str
 ) -> None:
-    assert max(gained(library, seed, **ATTACKS[loop], **change) for seed in range(100)) > 0.01
+    assert any(gained(library, seed, **ATTACKS[loop], **change) > 0.01 for seed in range(100))
 
 
 def wobbling(library: ctypes.CDLL, **changes: float) -> tuple[float, float]:

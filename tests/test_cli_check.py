@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
 
@@ -48,12 +49,27 @@ def test_check_names_what_bounces_and_how(
     contact: str, words: str, tmp_path: Path, call: Called
 ) -> None:
     text = scene_path("virtual_wall").read_text(encoding="utf-8")
-    line = f"e at most 0.74 ({words})"
+    line = f"e at most 0.74 ({words}): 1 m/s comes back as 0.74 m/s, a fall of 100 mm rebounds to "
     for solref, is_said in (("0.002 0.1", True), ("0.002 1", False)):
         path = tmp_path / "wall.xml"
         path.write_text(text.replace('solref="0.002 1"', f'solref="{solref}"'), encoding="utf-8")
         _, out, _ = call("check", path, "--contact", contact)
-        assert (line in out.replace("\n", " ")) == is_said
+        assert (line in " ".join(out.split())) == is_said
+
+
+def test_check_says_what_a_device_can_answer_a_tap_with(call: Called) -> None:
+    code, facts = facts_of(call, "check", "virtual_wall")
+    tap = facts["tap"]
+    assert (code, tap["spare"]) == (0, pytest.approx(0.3))
+    assert tap["pulse"] == pytest.approx(2 * math.sqrt(tap["spare"] * tap["burned"] / 1e-3))
+    out = call("check", "virtual_wall")[1]
+    assert (
+        "impact pulses        a tap at 0.2 m/s burns about 1 mJ, for a pulse of up to 1.1 N" in out
+    )
+    assert facts_of(call, "check", "virtual_wall", "--contact", "scene")[1]["tap"] is None
+    assert "impact pulses" not in call("check", "virtual_wall", "--contact", "scene")[1]
+    # its pawl turns on the tool
+    assert "impact pulses        none: no geom that collides" in call("check", "ratchet")[1]
 
 
 @pytest.mark.parametrize("is_fused", [False, True])

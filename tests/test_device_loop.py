@@ -29,6 +29,7 @@ from hapticbridge import (
     audit,
     read_recording,
 )
+from hapticbridge.audit.batch import audit_all
 from hapticbridge.errors import DeviceLost, HapticBridgeError
 from hapticbridge.program import poses
 from hapticbridge.program.device_loop import Handle, Surface
@@ -138,6 +139,24 @@ def test_a_handle_is_put_where_the_tool_is_put() -> None:
         device.advance(0.002)
         assert device.pose().position == pytest.approx([0.0, 0.5, 0.0], abs=1e-3)
         assert device.pose().matrix[:3, 3] == pytest.approx([0.0, 0.5, 0.0], abs=1e-3)
+
+
+@pytest.mark.parametrize("is_simulated", [True, False])
+def test_a_tool_that_moves_at_once_is_placed_where_it_was_put(
+    tmp_path: Path, *, is_simulated: bool
+) -> None:
+    """It moves before a tick has passed; the handle stays where the tool was put."""
+    path, tops = tmp_path / "run.mcap", [0.1, 0.3]
+    with DeviceLoop("simulated", recording=path, is_simulated=is_simulated) as device:
+        for top in tops:
+            device.show([0.0, 0.0, top], is_placed=True)
+            device.show([0.0, 0.0, top - 0.005])
+            assert device.pose().position[2] == top
+            device.advance(0.02) if is_simulated else time.sleep(0.1)
+    events = read_recording(path).events
+    assert [event["pose"][2] for event in events if event["event"] == "reset"] == tops
+    # of a program's scene nothing is known, in a table either
+    assert audit_all([path]).texts("environment").tolist() == ["toward the hand"]
 
 
 # What a program may say
@@ -467,9 +486,10 @@ def test_a_flood_of_places_pushes_no_command_of_a_user_out() -> None:
             program.settimeout(10.0)
             program.connect(endpoint.address)
             call = np.zeros(1, CALL_DTYPE)
-            call["version"], call["call"], call["post"]["pose"] = VERSION, Call.PLACE, START
+            call["version"], call["call"], call["post"]["pose"] = VERSION, Call.SHOW, START
+            call["place"] = START
             for sequence in range(1, 31):
-                call["sequence"] = sequence
+                call["sequence"] = call["placed"] = sequence
                 program.send(packed(call, TOKEN.encode()))
             end = time.monotonic() + 10.0
             while len(waiting) < MAX_WAITING and time.monotonic() < end:

@@ -140,8 +140,8 @@ def test_the_command_lists_topics_and_prints_a_page(call: Called) -> None:
     ("topic", "advice"),
     [
         ("passiv", "did you mean 'passivity'"),
-        ("tank", "the word is in 'glossary', "),
-        ("motor", "a heading with the word is in 'active-verdict'"),
+        ("tank", "the word is explained in 'glossary'"),
+        ("motor", "the word is explained in 'active-verdict'"),
         ("../../etc", "choose one of 'active-verdict', "),
     ],
 )

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kernel_runs import (
     FREE_BALL,
+    PLAIN,
     Array,
     Run,
     T,
@@ -47,8 +48,6 @@ from hapticbridge.kernel.law import (
     spring_energy,
     spring_length,
 )
-from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.pose import IDENTITY_POSE
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.scene import rehearsal
@@ -255,19 +254,8 @@ def test_the_audits_spring_is_the_kernels() -> None:
     assert twin.is_straight(sizes, np.full(len(sizes), 0.5)).tolist() == straight
 
 
-SCALED = RunParameters(
-    grip="grip",
-    period=T,
-    substeps=1,
-    coupling=STIFF,
-    scale=1.5,
-    force_scale=0.7,
-    force_limit=4.0,
-    torque_limit=0.3,
-    ramp_ticks=0,
-    device_origin=IDENTITY_POSE,
-    handle_origin=IDENTITY_POSE,
-    device_start=IDENTITY_POSE,
+SCALED = replace(
+    PLAIN, coupling=STIFF, scale=1.5, force_scale=0.7, force_limit=4.0, torque_limit=0.3
 )
 """Parameters of a run whose device feels a part of the tool's forces."""
 

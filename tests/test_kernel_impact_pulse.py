@@ -15,6 +15,7 @@ from kernel_runs import T, load
 from tapping import (
     COUPLING,
     DAMPING,
+    GAP,
     SPARE,
     Tapping,
     onset,
@@ -30,14 +31,16 @@ from hapticbridge.audit import audit
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.methods import METHODS
+from hapticbridge.demand.pulse import PULSES
 from hapticbridge.device.simulated.device import SimulatedDevice
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.kernel.tick import whole_tick
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.commands import Couple
-from hapticbridge.run.options import PULSES, BridgeOptions, pulse_of
+from hapticbridge.run.hands import Grasp
 
 
 def struck(taps: Tapping, speed: float, ticks: int = 40) -> Any:
@@ -102,6 +105,22 @@ def test_force_and_pulse_together_keep_the_limit() -> None:
         assert rows["pulse"].any()
 
 
+@pytest.mark.parametrize("is_near", [True, False])
+def test_force_and_pulse_together_keep_the_energy_limit(is_near: bool) -> None:
+    limit, speed = 0.04, 15.0
+    taps = tapping(guarding={"energy": limit, "full_speed": speed})
+    struck(taps, 0.1, 1)
+    observer = taps.kernel.state["observer"]
+    for _ in range(3):
+        if is_near:
+            observer["net_device_energy"] = 0.9 * limit
+        row = taps.tick(towards(0.0))
+        force, got = abs(row["wrench_on_device"][0]), float(observer["guarded_energy"][0])
+        assert got + T * force * speed <= 1.25 * limit
+        assert (row["pulse"][0] == 0.0) == is_near
+        assert not row["flags"] & TickFlag.CONTROLLER_ACTIVE
+
+
 def test_a_missing_sample_ends_the_pulse() -> None:
     taps = tapping()
     struck(taps, 0.3, 3)
@@ -132,6 +151,41 @@ def test_a_pause_ends_the_pulse() -> None:
     assert taps.pulse["held"] == 0.0
 
 
+@pytest.mark.parametrize("substeps", [1, 3])
+@pytest.mark.parametrize("method", ["implicit", "compensated"])
+def test_blows_in_each_substep_are_noted(method: str, substeps: int, tmp_path: Path) -> None:
+    scene, path = tmp_path / "wall.xml", tmp_path / "run.mcap"
+    scene.write_text(wall())
+    motion = tmp_path / "tap.csv"
+    motion.write_text("t,x,y,z,qw,qx,qy,qz\n0,0,0,0,1,0,0,0\n0.2,0.05,0,0,1,0,0,0\n")
+    device = SimulatedDevice(damping=DAMPING, path=str(motion))
+    limits = Limits(force=8.0, torque=0.5, ramp=0.0)
+    how: dict[str, Any] = {"method": method, "substeps": substeps, "limits": limits}
+    recorded(path, scene, device, Coupling(300.0, 0.5), duration=0.2, impact_pulses=1.0, **how)
+    blows = read_recording(path).ticks
+    speed = float(blows["blow_speed"].max())
+    assert blows["blow_energy"].sum() == pytest.approx(0.5 * 0.1 * speed**2, rel=0.2)
+    assert audit(path).resimulation == "bit for bit"
+
+
+def test_a_mocap_wall_that_strikes_the_tool_gives_a_blow_of_its_speed(tmp_path: Path) -> None:
+    scene, path = tmp_path / "wall.xml", tmp_path / "run.mcap"
+    geom = f'<geom type="box" size="0.02 0.2 0.2" pos="{GAP + 0.04} 0 0"/>'
+    assert geom in wall()
+    scene.write_text(wall().replace(geom, f'<body name="wall" mocap="true">{geom}</body>'))
+    device = SimulatedDevice(damping=DAMPING)
+
+    def move(bridge: Bridge, tick: int) -> None:
+        bridge.set_input(mocap={"wall": (-0.5e-3 * max(tick - 20, 0), 0.0, 0.0)})
+
+    coupling, limits = Coupling(300.0, 0.5), Limits(force=8.0, torque=0.5, ramp=0.0)
+    how: dict[str, Any] = {"impact_pulses": 1.0, "limits": limits}
+    recorded(path, scene, device, coupling, duration=0.065, on_tick=move, **how)
+    ticks = read_recording(path).ticks
+    assert ticks["blow_speed"].max() == pytest.approx(0.5, rel=0.05)
+    assert audit(path).resimulation == "bit for bit"
+
+
 # The account
 
 
@@ -142,7 +196,7 @@ def test_it_gets_the_share_of_what_the_blow_burned() -> None:
         burned = -np.diff(taps.ticks["environment_energy"], prepend=0.0)
         blows = taps.ticks["blow_energy"]
         expected = share * np.minimum(blows, np.maximum(burned, 0.0)).sum()
-        assert taps.pulse["earned"] == pytest.approx(expected, rel=1e-9)
+        assert taps.pulse["taken"] == pytest.approx(expected, rel=1e-9)
         assert 0.0 < expected <= share * -rows["environment_energy"][-1]
 
 
@@ -152,7 +206,7 @@ def test_the_tank_of_rigid_contacts_does_not_get_it_too() -> None:
     burned = -taps.rows[-1]["environment_energy"]
     cap = 0.5 * COUPLING.stiffness * 1e-6
     assert taps.rows[-1]["contact_tank"] == pytest.approx(
-        min(burned - float(taps.pulse["earned"]), cap), abs=1e-12
+        min(burned - float(taps.pulse["taken"]), cap), abs=1e-12
     )
 
 
@@ -189,7 +243,7 @@ def test_no_hand_gets_more_than_it_put_in(
     spent = float(taps.pulse["work"])
     assert (
         spent
-        <= float(taps.pulse["earned"])
+        <= float(taps.pulse["taken"])
         + SPARE * np.sum(np.diff(taps.ticks["device_position"][:, 0]) ** 2) / T
     )
     assert taps.kernel.state["observer"]["max_unpaid_energy"][0] <= 1e-9
@@ -228,8 +282,8 @@ def taken_from_pulses(
             place += v * T / parts
         if abs(place - goal) < 1e-6:
             goal = 0.0235 if goal < 0.02 else 0.005
-        last, most = newest, max(most, got - float(taps.pulse["earned"]))
-    return most, float(taps.pulse["earned"])
+        last, most = newest, max(most, got - float(taps.pulse["taken"]))
+    return most, float(taps.pulse["taken"])
 
 
 @pytest.mark.parametrize("delay", [0.25, 0.5, 0.75, 1.0])
@@ -343,27 +397,25 @@ def test_a_pulse_may_act_a_tick_later_on_a_real_device(is_real: bool, ticks: int
     assert setup.parameters(device.start(T), None).pulse_ticks == ticks
 
 
-def test_names_and_numbers_of_pulses() -> None:
-    assert pulse_of("steel") == PULSES["steel"]
-    assert pulse_of("250,8") == (250.0, 0.008)
-    for text in ("gold", "250", "250,0", "-1,8", "nan,8", "1,2,3"):
-        with pytest.raises(HapticBridgeError, match=r"pulse is .*; it must be one of .* HZ,MS"):
-            BridgeOptions(pulse=text)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"contact": "scene"}, "pulses need rigid contact"),
-        ({"scene_rate": 100.0}, "a scene that steps in every tick"),
+        ({"contact": "scene"}, r"impact-pulses is 0\.5, but contact is 'scene'"),
+        ({"scene_rate": 100.0}, "a step in every tick"),
         ({"rate": 500.0, "pulse": "300,5"}, "at most half the rate, 250"),
     ],
 )
-def test_runs_that_have_no_pulses_refuse_them(
-    tmp_path: Path, options: dict[str, Any], message: str
+def test_runs_that_have_no_pulses_refuse_them_before_they_begin(
+    options: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(HapticBridgeError, match=message):
-        recorded(tmp_path / "run.mcap", "virtual_wall", duration=0.01, impact_pulses=0.5, **options)
+        Bridge("virtual_wall", SimulatedDevice(), impact_pulses=0.5, **options)
+
+
+def test_several_hands_have_no_pulses() -> None:
+    hands = [Grasp("wrench"), Grasp("bolt")]
+    with pytest.raises(HapticBridgeError, match=r"impact-pulses is 0\.5, but several hands"):
+        Bridge("nut_and_wrench", hands, impact_pulses=0.5)
 
 
 # A recorded run

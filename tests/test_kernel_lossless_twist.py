@@ -17,9 +17,9 @@ from hapticbridge.audit import audit
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import Limits, guard_parameters_for
 from hapticbridge.demand.methods import LOSSLESS_COUPLING as LOSSLESS
-from hapticbridge.demand.methods import prepare
+from hapticbridge.demand.methods import unguarded_parameters
 from hapticbridge.kernel.jit import compiled
-from hapticbridge.kernel.parameters import GuardParameters, RunParameters
+from hapticbridge.kernel.parameters import GuardParameters
 from hapticbridge.kernel.pose import (
     dot,
     product,
@@ -55,21 +55,11 @@ def twisted(
 
     ``pays`` is the damping that may pay for the midpoint torque; inf takes all of it.
     """
-    prepare(scene, LOSSLESS.requested_coupling(law, T), T, 1, LOSSLESS, warns=False)
-    start = (0.0, 0.0, 0.0, math.cos(twist / 2), math.sin(twist / 2), 0.0, 0.0)
-    parameters = RunParameters(
-        grip=scene.grip,
-        period=T,
-        substeps=1,
+    requested = LOSSLESS.requested_coupling(law, T)
+    parameters = replace(
+        unguarded_parameters(scene, requested, T, 1, LOSSLESS),
         coupling=law,
-        force_limit=1e9,
-        torque_limit=1e9,
-        ramp_ticks=0,
-        device_origin=IDENTITY,
-        handle_origin=scene.grip_pose(),
-        device_start=start,
-        scheme=LOSSLESS.scheme,
-        is_rigid=LOSSLESS.is_rigid,
+        device_start=(0.0, 0.0, 0.0, math.cos(twist / 2), math.sin(twist / 2), 0.0, 0.0),
         device_damping=2.0,
         device_rotational_damping=b_r,
         guarding=GuardParameters(has_hand=True, twist_damping=b_r if pays is None else pays),

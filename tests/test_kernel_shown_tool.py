@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from adversary import UNPAID, Attack
-from kernel_runs import IDENTITY, T
+from kernel_runs import T, unlimited
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
@@ -17,7 +17,6 @@ from hapticbridge.demand.methods import method_named, prepare
 from hapticbridge.device import AXES, DEFAULT_HAND, DeviceInfo
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, take_result, whole_tick
@@ -45,7 +44,7 @@ def test_no_hand_gets_energy_out_of_a_slower_scene(ticks: int) -> None:
 
 
 def test_results_that_nobody_pays_for_are_seen_to_give_energy() -> None:
-    assert max(attack(seed, 20, pays=False) for seed in range(60)) > 0.1
+    assert any(attack(seed, 20, pays=False) > 0.1 for seed in range(60))
 
 
 def rms(values: NDArray[np.float64]) -> float:
@@ -63,20 +62,15 @@ class Loop:
         prepare(self.scene, law, max(ticks, 1) * T, substeps, method, warns=False)
         self.scene.set_gains(*method.gains(law, max(ticks, 1) * T / substeps))
         self.scene.reset()
-        parameters = RunParameters(
-            grip=self.scene.grip,
-            period=T,
-            substeps=substeps,
-            coupling=law,
+        self.parameters = parameters = unlimited(
+            self.scene,
+            law,
+            T,
+            substeps,
+            scheme=method.scheme,
+            scene_ticks=ticks,
             force_limit=10.0,
             torque_limit=0.5,
-            ramp_ticks=0,
-            device_origin=IDENTITY,
-            handle_origin=self.scene.grip_pose(),
-            device_start=IDENTITY,
-            scheme=method.scheme,
-            is_rigid=True,
-            scene_ticks=ticks,
         )
         model, data = self.scene.model, self.scene.data
         self.fast = self.slow = BoundKernel(model, data, parameters)
@@ -297,7 +291,7 @@ def test_the_credit_follows_a_change_of_the_coupling() -> None:
     loop.run(np.zeros((20, 3)))
     soft = replace(LAW, stiffness=0.25 * LAW.stiffness)
     method = method_named("lossless")
-    goal = replace(TO_REPLACE, coupling=soft, scene_ticks=10)
+    goal = replace(loop.parameters, coupling=soft)
     loop.fast.tune(goal, method.gains(soft, 10 * T), 1)
     loop.run(np.zeros((20, 3)))
     pose = loop.fast.state["pose"]
@@ -332,7 +326,7 @@ def test_the_verdict_forgives_what_the_scene_was_lent_and_no_more() -> None:
 
 
 def test_a_slower_scene_needs_a_method_that_solves_its_coupling() -> None:
-    parameters = replace(TO_REPLACE, scene_ticks=10)
+    parameters = Loop("point_mass", 10).parameters
     assert parameters.scene_period == pytest.approx(10 * T)
     assert parameters.of_scene.period == parameters.scene_period
     assert parameters.of_scene.scene_ticks == 0
@@ -344,17 +338,3 @@ def test_a_slower_scene_needs_a_method_that_solves_its_coupling() -> None:
     for changes, words in refused:
         with pytest.raises(HapticBridgeError, match=words):
             replace(parameters, **changes)
-
-
-TO_REPLACE = RunParameters(
-    grip="grip",
-    period=T,
-    substeps=1,
-    coupling=LAW,
-    force_limit=10.0,
-    torque_limit=0.5,
-    ramp_ticks=0,
-    device_origin=IDENTITY,
-    handle_origin=IDENTITY,
-    device_start=IDENTITY,
-)

@@ -83,7 +83,7 @@ def test_at_the_cut_the_torque_flips_by_twice_pi_stiffness_in_one_tick() -> None
 
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
-    boundary = boundary_of(rotation, tmp_path, 190)
+    boundary = boundary_of(rotation, tmp_path, 20)
     assert boundary["fastest_passive"]["implicit"] > 0
     assert boundary["fastest_passive"]["explicit"] is None
     assert boundary["cut"]["speed_measured"] == pytest.approx(rotation.cut_speed(SOFT), rel=0.02)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,11 @@ from numpy.typing import NDArray
 from hapticbridge import Bridge, BridgeOptions, SimulatedClock, Summary, Workspace, audit
 from hapticbridge.audit import AuditReport
 from hapticbridge.coupling import Coupling
-from hapticbridge.demand.methods import method_named, prepare
+from hapticbridge.demand.methods import method_named, unguarded_parameters
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.parameters import GuardParameters, RunParameters
+from hapticbridge.kernel.parameters import GuardParameters
 from hapticbridge.kernel.record import POST_DTYPE, SAMPLE_DTYPE, TickFlag
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import posted_tick
@@ -51,7 +52,7 @@ def test_a_tool_that_turns_past_half_a_turn_gives_nothing() -> None:
 
 
 def test_a_program_that_nobody_pays_for_is_seen_to_give_joules() -> None:
-    assert max(attack(seed, pays=False) for seed in range(60)) > 1.0
+    assert any(attack(seed, pays=False) > 1.0 for seed in range(60))
 
 
 def post_of(position: Any, quaternion: Any = UPRIGHT, **values: Any) -> NDArray[np.void]:
@@ -396,19 +397,11 @@ def test_a_late_torque_gives_nothing_to_a_hand_that_wobbles_about_a_twist() -> N
     law, period = Coupling(100.0, 0.0, 1.0, 5e-4), 1e-3
     b = float(minimum_damping(Coupling(1.0, 5e-4, 0.0, 0.0), period, delay=1.0))
     scene, method = posted_scene(CREDIT), method_named("implicit")
-    prepare(scene, law, 0.02, 1, method, warns=False)
-    start = (0.0, 0.0, 0.0, *UPRIGHT)
-    parameters = RunParameters(
-        grip=scene.grip,
+    parameters = replace(
+        unguarded_parameters(scene, law, 0.02, 1, method),
         period=period,
-        substeps=1,
-        coupling=law,
         force_limit=10.0,
         torque_limit=5.0,
-        ramp_ticks=0,
-        device_origin=start,
-        handle_origin=start,
-        device_start=start,
         device_damping=1.0,
         device_rotational_damping=b,
         scene_ticks=20,

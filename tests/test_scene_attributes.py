@@ -476,6 +476,28 @@ def test_each_attribute_is_kept_or_is_changed_and_said(tmp_path: Path, element: 
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("contact", ["rigid", "scene"])
+@pytest.mark.parametrize("element", ["option", "body/joint", "actuator/general", "deformable/flex"])
+def test_a_run_changes_no_more_than_its_preparation(
+    tmp_path: Path, element: str, contact: str
+) -> None:
+    path = tmp_path / "scene.xml"
+    path.write_text(with_attributes(element, ""))
+    prepared = hb.load_scene(path)
+    coupling = hb.Coupling(500.0, 2.0, 0.2, 0.01)
+    prepare(prepared, coupling, 0.001, 1, replace(IMPLICIT, is_rigid=contact == "rigid"))
+    before = values(prepared.model)
+    options: dict[str, Any] = {"contact": contact, "method": "implicit", "tool_weight": True}
+    clock = hb.SimulatedClock()
+    with hb.Bridge(path, "simulated:hand=none", coupling, clock=clock, **options) as bridge:
+        bridge.run(duration=0.01)
+        more = differing(before, values(bridge.scene.model))
+    # where rigid contacts and limits begin to look
+    assert {name for name in more if not name.endswith("_margin")} == set()
+    assert not more or contact == "rigid"
+
+
+@pytest.mark.filterwarnings("ignore")
 def test_passive_contacts_of_a_flex_become_constraints_or_are_refused_as_is(tmp_path: Path) -> None:
     path = tmp_path / "flex.xml"
     path.write_text(with_attributes("body/flexcomp/contact", 'passive="true"'))

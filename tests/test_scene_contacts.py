@@ -87,9 +87,7 @@ def test_softer_is_never_worse(timeconst: float, ratio: float, longer: float, mo
 def test_suggestion_is_strict_and_silent_at_every_time_step(timestep: float) -> None:
     first, second = contacts.SUGGESTED[0] * timestep, contacts.SUGGESTED[1]
     assert contact_numbers((first, second), SOLIMP, timestep).grade == "strict"
-    assert (
-        contact_concerns(ContactSetting((first, second), SOLIMP), timestep, diagexact=False) == []
-    )
+    assert contact_concerns(ContactSetting((first, second), SOLIMP), timestep) == []
     words = contacts.suggested_solref(timestep).split('"')[1].split()
     assert [float(word) for word in words] == pytest.approx([first, second], rel=1e-5)
 
@@ -105,13 +103,12 @@ NOT_MET = f'<geom name="lamp" size="0.01" pos="3 3 3" contype="4" conaffinity="4
         ((0.004, 2.0), (0.99, 0.99, 0.001),
          ("larger impedance (0.99, at most 0.91)",
           'write solref="0.0005 8" and solimp="0.9 0.95 0.001"')),
-        ((0.02, 1.0), SOLIMP, ("is soft: a steady force sinks in 100 times as deep",)),
     ],
 )  # fmt: skip
 def test_what_to_write_is_told(solref: Any, solimp: Any, words: tuple[str, ...]) -> None:
-    (said, *_) = contact_concerns(ContactSetting(solref, solimp), H)
+    (said,) = contact_concerns(ContactSetting(solref, solimp), H)
     assert all(word in str(said) for word in words)
-    assert (contact_numbers(solref, solimp, H).grade == "active") == (len(words) > 1)
+    assert contact_numbers(solref, solimp, H).grade == "active"
 
 
 @pytest.mark.parametrize(
@@ -138,11 +135,6 @@ def test_pyramids_are_named_only_where_friction_is_low_but_not_left_out() -> Non
     assert rough == without == []
 
 
-def test_approximate_diagonal_is_named_unless_the_contact_is_strict_anyway() -> None:
-    (said,) = contact_concerns(ContactSetting((0.002, 1.0), SOLIMP), H, diagexact=False)
-    assert 'write <flag diagexact="enable"/>' in str(said)
-
-
 def test_contact_without_a_spring_stores_nothing_and_sinks_for_ever() -> None:
     numbers = contact_numbers((0.0, -100.0), SOLIMP, H)
     assert numbers.grade == "strict"
@@ -150,16 +142,16 @@ def test_contact_without_a_spring_stores_nothing_and_sinks_for_ever() -> None:
 
 
 @pytest.mark.parametrize("name", scene_names(1))
-def test_shipped_scenes_obey_the_whole_rule(name: str) -> None:
+def test_shipped_scenes_obey_the_rule(name: str) -> None:
     loaded = load_scene(name)
-    assert check_contacts(loaded.model, loaded.grip, is_thorough=True) == []
+    assert check_contacts(loaded.model, loaded.grip) == []
 
 
-def concerns_of(path: Path, *, is_thorough: bool = False) -> list[str]:
+def concerns_of(path: Path) -> list[str]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         loaded = load_scene(path)
-    return [*map(str, check_contacts(loaded.model, loaded.grip, is_thorough=is_thorough))]
+    return [*map(str, check_contacts(loaded.model, loaded.grip))]
 
 
 PAIR = f'<contact><pair geom1="tip" geom2="floor" {HARD}/></contact>'
@@ -187,18 +179,6 @@ def test_a_contact_at_fault_is_named_by_its_geoms_and_setting(
     told = concerns_of(scene(tmp_path, floor=floor, tip=tip, more=more, cone=cone))
     assert len(told) == (words is not None)
     assert all(word in told[0] for word in words or ())
-
-
-def test_defaults_and_an_approximate_diagonal_are_mentioned_only_when_asked(tmp_path: Path) -> None:
-    path = scene(tmp_path, floor="", tip="", cone="pyramidal")
-    said = " ".join(concerns_of(path, is_thorough=True))
-    assert "is soft" in said and PLAIN in said
-    loaded = load_scene(scene(tmp_path, floor=GOOD, tip=GOOD))
-    assert check_contacts(loaded.model, loaded.grip, is_thorough=True) == []
-    loaded.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT)
-    assert check_contacts(loaded.model, loaded.grip) == []
-    (found,) = check_contacts(loaded.model, loaded.grip, is_thorough=True)
-    assert "approximate diagonal" in found.words
 
 
 def prepared(

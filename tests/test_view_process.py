@@ -12,7 +12,7 @@ import pytest
 from audit_cases import ScriptedDevice, recorded
 from report_runs import LOOSE
 from two_hands import GRIPS, SCENES, two_handed
-from view_cases import AT_ONCE, FLOOR, Canvas, pressed
+from view_cases import AT_ONCE, FLOOR, Canvas, pressed, tapped_wall
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
@@ -159,6 +159,28 @@ def test_a_live_view_shows_every_hand_that_has_a_handle(tmp_path: Path, scene: s
         Ghost(canvas, replay.scenery, hand).show(held, 1.0, 1.0)
         name = "/handle 2" if hand else "/handle"
         assert canvas.__dict__[name].position.tolist() == held.handle.tolist()
+
+
+def test_a_live_view_shows_each_blow_with_the_energy_of_the_run_simulated_again(
+    tmp_path: Path,
+) -> None:
+    watcher, sights = Watcher(), list[Sight]()
+
+    def look(_bridge: Bridge, _tick: int) -> None:
+        assert watcher.live is not None
+        if (sight := watcher.live.look()) is not None:
+            sights.append(sight)
+
+    stage, blows = Stage(tapped_wall(tmp_path, on_tick=look, observer=watcher)), set[float]()
+    for sight in sights:
+        stage.show(stage.tick_at(sight.time))
+        assert (sight.blow is None) == (stage.blow is None)
+        if sight.blow is not None and stage.blow is not None:
+            assert sight.blow.words == stage.blow.words
+            # it is where the next picture has a contact, or where the grip was
+            assert np.linalg.norm(sight.blow.place - stage.blow.place) < 0.025
+            blows.add(sight.blow.time)
+    assert len(blows) == 2
 
 
 def test_a_picture_that_is_being_written_is_not_shown() -> None:

@@ -16,9 +16,9 @@ import pytest
 import zstandard
 from chromium import browser
 from cli_cases import Called
-from view_cases import pressed_floor
+from view_cases import pressed_floor, tapped_wall
 
-from hapticbridge.errors import HapticBridgeError
+from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import install_command
 from hapticbridge.recording import read_recording
 from hapticbridge.replay.stage import Stage
@@ -29,6 +29,7 @@ pytest.importorskip("viser", reason="needs the extra 'view'")
 import msgspec
 from page_client import PATIENCE, hand, said
 
+from hapticbridge.view.page import Sight
 from hapticbridge.view.replay import Replay, Theatre
 
 # viser's threads and sockets end with the process
@@ -149,6 +150,38 @@ def test_a_saved_page_holds_the_whole_run(replay: Replay, call: Called, tmp_path
     assert len(moves) > 10
     for time, position in moves:
         np.testing.assert_allclose(position, replay.sight_at(time).places[ball], atol=1e-6)
+
+
+def test_page_and_saved_page_show_a_blow_for_a_time(tmp_path: Path) -> None:
+    replay = Replay(tapped_wall(tmp_path))
+    (first, *_) = (sight for sight in replay.sights if sight.blow is not None)
+    again = Sight.from_parts(first.parts(), replay.scenery.bodies, 0).blow
+    assert first.blow is not None
+    assert again is not None
+    assert again.parts() == first.blow.parts()
+    broken = [*first.parts()[:-1], [0.0] * 6]
+    with pytest.raises(RecordingError, match="cannot be drawn"):
+        Sight.from_parts(broken, replay.scenery.bodies, 0)
+    with served(replay, Address(0)) as (theatre, _), hand(theatre.url) as client:
+        client.send("time (s)", value=first.time)
+        assert said(client, f"**{first.time:.3f}").endswith(first.blow.words)
+        held = embedded(theatre.page())["messages"]
+    marks = [(time, each) for time, each in held if each.get("name") == "/blow"]
+    seen = [
+        (time, each["visible"])
+        for time, each in marks
+        if each["type"] == "SetSceneNodeVisibilityMessage"
+    ]
+    # it is not seen at first; two blows are 1/3 s apart, and a blow is marked for longer
+    assert seen == [(0.0, False), (pytest.approx(first.time, abs=replay.step), True)]
+    places = [each["position"] for _, each in marks if each["type"] == "SetPositionMessage"]
+    np.testing.assert_allclose(places[-2:], [first.blow.place] * 2, atol=1e-3)
+    words = [
+        each["updates"]["text"]
+        for _, each in held
+        if each.get("name") == "/blow/words" and "updates" in each
+    ]
+    assert first.blow.words in words
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -10,12 +11,12 @@ from adversary import turn
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.demand.methods import Method, method_named, prepare
+from hapticbridge.demand.methods import Method, method_named, unguarded_parameters
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.force_level import keep_state, limited_wrench_after_step
 from hapticbridge.kernel.jit import compiled, direct
 from hapticbridge.kernel.ledger import meter_ports
-from hapticbridge.kernel.parameters import GuardParameters, RunParameters
+from hapticbridge.kernel.parameters import GuardParameters
 from hapticbridge.kernel.pose import dot
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.state import BoundHands
@@ -97,8 +98,6 @@ GRIPS = {"tongs": ("left", "joint:hinge")}
 LEVER = 10.0
 """Motion of the hinge of the tongs per motion of the grip axis in rad/m."""
 
-START = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-
 TICKS = 1500
 """Ticks of an attack."""
 
@@ -116,35 +115,22 @@ def bound_hands(
     couplings: tuple[Coupling, Coupling],
     period: float,
     method: Method,
-    **changes: object,
+    **changes: Any,
 ) -> BoundHands:
     """Prepares a scene for two hands without devices, and binds their states."""
-    prepare(scene, couplings[0], period, 1, method, warns=False)
+    plain = unguarded_parameters(scene, couplings[0], period, 1, method)
     laws = tuple(method.law_coupling(coupling, period) for coupling in couplings)
     scene.of_hand(1).set_gains(*method.gains(laws[1], period))
-    basis: dict[str, object] = {
-        "period": period,
-        "substeps": 1,
-        "force_limit": 1e9,
-        "torque_limit": 1e9,
-        "ramp_ticks": 0,
-        "device_origin": START,
-        "device_start": START,
-        "scheme": method.scheme,
-        "is_rigid": method.is_rigid,
-    }
     parameters = []
     for hand in range(2):
         held = scene.of_hand(hand)
+        own: dict[str, Any] = {
+            "grip": held.grip,
+            "coupling": laws[hand],
+            "handle_origin": held.grip_pose(),
+        }
         levers = dict.fromkeys(("scale", "force_scale"), LEVER if held.joint >= 0 else 1.0)
-        parameters.append(
-            RunParameters(
-                grip=held.grip,
-                coupling=laws[hand],
-                handle_origin=held.grip_pose(),
-                **(basis | levers | changes),  # type: ignore[arg-type] # a mapping of fields
-            )
-        )
+        parameters.append(replace(plain, **(own | levers | changes)))
     return BoundHands(scene.model, scene.data, parameters)
 
 

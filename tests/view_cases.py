@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from audit_cases import ScriptedDevice
+from audit_cases import ScriptedDevice, recorded
 from report_runs import LOOSE, made_in
+from tapping import DAMPING, GAP, wall
 
+from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import Limits
 
 FLOOR = """<mujoco model="floor">
@@ -39,6 +42,23 @@ def pressed_floor(folder: Path) -> Path:
     """Records a ball that is moved aside and pressed onto a floor, and held there."""
     path, device = folder / "floor.mcap", ScriptedDevice(pressed)
     return made_in(path, FLOOR, device, LOOSE, duration=1.5, limits=AT_ONCE)
+
+
+def tap(tick: int) -> tuple[float, ...]:
+    """A hand that goes 12 mm beyond the wall and back, three times a second."""
+    reach = 0.5 * (GAP + 0.012)
+    return (reach * (1 - math.cos(0.006 * math.pi * tick)), 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+def tapped_wall(folder: Path, **how: Any) -> Path:
+    """Records two taps on a wall, with pulses; ``how`` are further arguments of ``recorded``."""
+    path, scene = folder / "run.mcap", folder / "wall.xml"
+    scene.write_text(wall())
+    device, coupling = ScriptedDevice(tap, damping=DAMPING), Coupling(1000.0, 0.5, 1.0, 5e-4)
+    limits = Limits(force=8.0, torque=0.5, ramp=0.0)
+    pulses: dict[str, Any] = {"impact_pulses": 1.0, "limits": limits}
+    recorded(path, scene, device, coupling, duration=0.6, **pulses, **how)
+    return path
 
 
 class Canvas:

@@ -137,7 +137,7 @@ def audit_point(
         }
     known: dict[str, Value] = {name: getattr(report, name) for name in _COLUMNS}
     known["reason"] = report.reason[:_MAX_REASON]
-    known["environment"] = report.environment or ""
+    known["environment"] = report.state
     known["certified"] = report.answer
     if report.damping_margin is not None:
         known["damping_margin"] = report.damping_margin

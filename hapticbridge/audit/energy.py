@@ -98,25 +98,30 @@ def _springs_at_start(parameters: RunParameters, gains: Array, motion: Motion) -
 def shown_work(block: AuditedBlock, events: RunEvents) -> Array:
     """Returns P, the coupling's work on a tool that is shown between a scene's steps, (n,) in J.
 
-    It is that for a device in time. Behind a delay, and before another program, P is f·δx + τ·δφ
-    where that is less.
-
         P = V(h − y_{k−1}) − V(h − y_k) + f_d·δy + the same for torques
 
     V is the energy of the spring up to the force level, f_d the wrench beyond the spring's own.
+    Behind a delay, and before another program, a spring gives ‖Δf‖²/2K less, with Δf the change of
+    its own force by δy, and no more than f·δy.
     """
     ticks, motion, parameters = block.ticks, block.motion, events.parameters
     gains, wrench = events.gains(ticks["tick"]), ticks["wrench_on_tool"]
     twist_before = turn_between(motion.tool_before[:, 3:], ticks["handle_quaternion"])
-    work = np.zeros(len(ticks))
+    work, is_late = np.zeros(len(ticks)), block.is_posted or parameters.device_delay > 0.0
     linear, angular = springs(gains, parameters)
     for spring, part, before, after, step in (
         (linear, slice(0, 3), motion.stretch + motion.tool_step, motion.stretch, motion.tool_step),
         (angular, slice(3, 6), twist_before, motion.twist, motion.tool_turn),
     ):
-        work += spring.energy(before)
-        work -= spring.energy(after)
-        work += np.sum((wrench[:, part] - spring.force(after)) * step, axis=1)
+        given = spring.energy(before) - spring.energy(after)
+        given += np.sum((wrench[:, part] - spring.force(after)) * step, axis=1)
+        if is_late:
+            change = np.sum((spring.force(after) - spring.force(before)) ** 2, axis=1)
+            given -= 0.5 * np.divide(
+                change, spring.stiffness, out=np.zeros_like(change), where=spring.stiffness > 0
+            )
+            given = np.minimum(given, np.sum(wrench[:, part] * step, axis=1))
+        work += given
     return work
 
 
@@ -228,8 +233,7 @@ class EnergyBalance:
         # with several laws per tick the mean wrench does not determine the summed work
         coupling_work = ticks["coupling_work"]
         if parameters.scene_ticks:
-            exact, is_late = shown_work(block, events), parameters.device_delay > 0.0
-            work = np.minimum(exact, work) if block.is_posted or is_late else exact
+            work = shown_work(block, events)
         if parameters.law_evaluations == 1:
             coupling_work = _summed(work, before["coupling_work"])
         stored = ticks["kinetic"] + ticks["potential"] - block.state.start_energy
@@ -286,7 +290,7 @@ class EnergyBalance:
             hidden_energy=float(totals["hidden_energy"][-1]) * parameters.guarding.has_hand,
             gross_energy=(totals["hand_energy"] - totals["unfelt_work"])
             * parameters.guarding.has_hand,
-            unpaid_energy=(unpaid - pulses.paid(before)) * parameters.guarding.has_hand,
+            unpaid_energy=(unpaid - pulses.paid(before, parameters)) * parameters.guarding.has_hand,
             coupling_account=ratio * (coupling_work + held),
             springs=float(totals["start_springs"][-1]),
             input_work=totals["inputs"],

@@ -314,7 +314,6 @@ SUMS = (
     "sent_y",
     "sent_z",
     "pulse_account",
-    "pulse_earned",
     "pulse_work",
     "pulse_taken",
     "pulse_size",

@@ -14,7 +14,7 @@ from hapticbridge.audit.events import RunEvents
 from hapticbridge.audit.motion import Array
 from hapticbridge.audit.structure import TOLERANCE, Deviation
 from hapticbridge.audit.wrench_limits import AuditedBlock
-from hapticbridge.kernel.impact_pulse import FASTEST
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import UNITS, TickFlag, has_flag
 from hapticbridge.kernel.restitution import BLOW_SPEED
 
@@ -56,9 +56,9 @@ class PulseBalance:
 
     Attributes:
         account: What may still pay for pulses, after each tick, (n,) in J.
-        earned: All that blows paid in, (n,) in J at the hand.
         work: Σ p·δp until the tick's sample, (n,) in J.
-        taken: Energy in J of the scene that the tank of rigid contacts did not get, (n,).
+        taken: Energy in J of the scene that blows paid in and the tank of rigid contacts did not
+            get, (n,); at the hand it is force_scale / scale times as much.
         short: Charges to come that the account does not cover where a pulse is sent, (n,) in J.
         size: Size of what was added up, (n,) in J.
         spare: b_s, on which pulses count, (n,) in N s/m; 0 from the first change of the coupling.
@@ -66,7 +66,6 @@ class PulseBalance:
     """
 
     account: Array
-    earned: Array
     work: Array
     taken: Array
     short: Array
@@ -80,10 +79,9 @@ class PulseBalance:
         ticks, parameters, state = block.ticks, events.parameters, block.state
         n, ratio = len(ticks), parameters.energy_ratio
         if parameters.impact_pulses == 0.0:
-            return cls(*(np.zeros(n) for _ in range(8)))
+            return cls(*(np.zeros(n) for _ in range(7)))
         before, d = state.sums, parameters.pulse_ticks
-        speed = min(parameters.guarding.speed, FASTEST)
-        period = parameters.period
+        speed, period = parameters.pulse_speed, parameters.period
         spare = np.where(ticks["tick"] < events.first_change, parameters.pulse_damping, 0.0)
         rows = np.concatenate([state.row, ticks])
         moved = np.diff(rows["device_position"], axis=0)
@@ -115,6 +113,7 @@ class PulseBalance:
         charge = np.where(is_known, np.minimum(work, most), most)
         burned = np.maximum(-np.diff(created, prepend=before["created"]), 0.0)
         taken = parameters.impact_pulses * np.minimum(ticks["blow_energy"], burned)
+        earned = ratio * taken
         own = np.linalg.norm(ticks["pulse"], axis=1)
         to_come, covered = (
             period * np.sum([_most(size, spare, speed) for size in accumulate(each, np.maximum)], 0)
@@ -127,16 +126,15 @@ class PulseBalance:
             free = max(account - charge, 0.0) - to_come
             return free + to_come - max(free, 0.0) * (1.0 - kept) + earned
 
-        steps = zip(charge, to_come, ratio * taken, strict=True)
+        steps = zip(charge, to_come, earned, strict=True)
         accounts = accumulate(steps, after, initial=before["pulse_account"])
         account = np.fromiter(accounts, float, n + 1)[1:]
         return cls(
             account=account,
-            earned=before["pulse_earned"] + np.cumsum(ratio * taken),
             work=before["pulse_work"] + np.cumsum(works[0]),
             taken=before["pulse_taken"] + np.cumsum(taken),
-            short=np.where(own > 0.0, covered - (account - ratio * taken), 0.0),
-            size=before["pulse_size"] + np.cumsum(np.abs(works[0]) + ratio * taken),
+            short=np.where(own > 0.0, covered - (account - earned), 0.0),
+            size=before["pulse_size"] + np.cumsum(np.abs(works[0]) + earned),
             spare=spare,
             held=held,
         )
@@ -146,17 +144,16 @@ class PulseBalance:
         """Cumulative energies that the next block continues, by the names of ``events.SUMS``."""
         return {
             "pulse_account": self.account,
-            "pulse_earned": self.earned,
             "pulse_work": self.work,
             "pulse_taken": self.taken,
             "pulse_size": self.size,
             "pulse_held": self.held,
         }
 
-    def paid(self, before: dict[str, float]) -> Array:
+    def paid(self, before: dict[str, float], run: RunParameters) -> Array:
         """Returns the work that blows had paid for at each tick's sample, (n,) in J."""
-        earned = np.concatenate([[before["pulse_earned"]], self.earned[:-1]])
-        return np.asarray(np.minimum(self.work, earned))
+        taken = np.concatenate([[before["pulse_taken"]], self.taken[:-1]])
+        return np.asarray(np.minimum(self.work, run.force_scale / run.scale * taken))
 
     def deviations(self, block: AuditedBlock) -> Iterator[Deviation]:
         """Yields the deviations of account, pulses and blows."""

@@ -140,8 +140,12 @@ class AuditReport:
     @property
     def words(self) -> str:
         """The verdict in a few words; see ``verdict_words``."""
-        environment = "toward the hand" if self.credit else self.environment or ""
-        return verdict_words(self.verdict, environment, self.port)
+        return verdict_words(self.verdict, self.state, self.port)
+
+    @property
+    def state(self) -> str:
+        """Environment in words; of a scene that another program stepped nothing is known."""
+        return "toward the hand" if self.credit else self.environment or ""
 
     def _repr_html_(self) -> str:
         """Returns verdict, reason and conditions as HTML, for a notebook."""

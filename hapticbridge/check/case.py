@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.check.observe import MAX_WORK, Observation, observe
+from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.demand.methods import RIGID, default_method
+from hapticbridge.demand.pulse import Tap
 from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice, read_motion
 from hapticbridge.device.base import checked_number
@@ -24,8 +26,11 @@ from hapticbridge.device.trajectory import DEFAULT_SECONDS, lissajous
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.kernel.record import SAMPLE_DTYPE
+from hapticbridge.kernel.shown_tool import tool_geoms
 from hapticbridge.recording import read_recording
+from hapticbridge.run.options import BridgeOptions, RunSetup, Workspace
 from hapticbridge.scene import Scene, SceneSource, compile_scene
+from hapticbridge.scene.contacts import meeting_pairs
 from hapticbridge.scene.fault import CompiledScene
 from hapticbridge.scene.source_map import Places
 
@@ -146,6 +151,28 @@ class SceneUnderCheck(CompiledScene):
     def setting(self) -> RunPoint:
         """Coupling, period and contact of the run."""
         return RunPoint(self.coupling, self.period, contact=self.contact)
+
+    @property
+    def tap(self) -> Tap | None:
+        """Tap of the tool in a run with pulses of blows; None if it can have none.
+
+        Contacts must be rigid, and a geom that collides be rigid with the grip.
+        """
+        model = self.scene.model
+        is_tool = tool_geoms(model, model.site(self.scene.grip).id)
+        meets = {geom for pair in meeting_pairs(model) for geom in pair[:2]}
+        if not (self.is_rigid and any(is_tool[geom] for geom in meets)):
+            return None
+        mujoco.mj_forward(model, self.scene.data)
+        options = BridgeOptions(
+            rate=1.0 / self.period,
+            workspace=Workspace(scale=self.scale, force_scale=self.scale),
+            impact_pulses=1.0,
+        )
+        setup = RunSetup.resolve(
+            self.scene, self.info, self.coupling, options, SimulatedClock(), is_recorded=False
+        )
+        return setup.tap()
 
     @property
     def law(self) -> Coupling:

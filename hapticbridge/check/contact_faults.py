@@ -73,7 +73,6 @@ def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             setting,
             case.step,
             cone="elliptic" if option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else "pyramidal",
-            only_active=True,
         ):
             clause, change, is_cone = concern
             if is_cone and is_cone_reported:

@@ -25,7 +25,7 @@ from hapticbridge.check.case import (
 )
 from hapticbridge.check.cost import TICK_SHARE, Cost, Growth, draw_cost, measure_cost
 from hapticbridge.check.findings import find_faults
-from hapticbridge.check.inventory import MEETS_TOOL, Inventory, take_inventory
+from hapticbridge.check.inventory import MEETS_TOOL, TOOL, Inventory, take_inventory
 from hapticbridge.check.lean import (
     MAY_GO,
     SAVES_NOTHING,
@@ -35,6 +35,7 @@ from hapticbridge.check.lean import (
     find_lean,
 )
 from hapticbridge.check.lean_output import check_lean_target, lean_facts, write_lean
+from hapticbridge.check.perception import tap_words
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress, working
@@ -42,6 +43,7 @@ from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.demand.methods import RIGID, Contact, RunCoupling, default_method
+from hapticbridge.demand.pulse import Tap
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.mujoco_c import quiet
@@ -169,8 +171,28 @@ _BOUNCES = {"rigid": "as rigid impacts", "scene": "by MuJoCo's springs, as in th
 """Cause of a bounce, by the kind of contacts."""
 
 
-def print_inventory(inventory: Inventory, contact: str) -> None:
-    """Prints what the scene models, with the stiffness of the contacts that a run takes."""
+def _blow_lines(inventory: Inventory, contact: str, tap: Tap | None) -> dict[str, str]:
+    """Returns what a blow does in the scene and on the device, by the head of its line."""
+    lines = {}
+    if inventory.bounces:
+        each = (f"{one.names}, e at most {one.e:.2g}" for one in inventory.bounces)
+        e = max(one.e for one in inventory.bounces)
+        lines["bounces"] = (
+            f"{'; '.join(each)} ({_BOUNCES[contact]}):\n{'':23}1 m/s comes back as {e:.2g} m/s, a "
+            f"fall of 100 mm rebounds to {100.0 * e * e:.2g} mm"
+        )
+    if tap is not None:
+        lines["impact pulses"] = f"{tap_words(tap)}\n{'':23}(--impact-pulses 1)"
+    elif contact == RIGID and inventory.geoms[TOOL]:
+        lines["impact pulses"] = "none: no geom that collides is rigid with the grip"
+    return lines
+
+
+def print_inventory(inventory: Inventory, contact: str, tap: Tap | None) -> None:
+    """Prints what the scene models, with the stiffness of the contacts that a run takes.
+
+    ``tap`` is a tap of the tool in a run with pulses; None leaves it out.
+    """
     out.print("\n[bold]What it models[/]")
     uses = ", ".join(f"{count} {use}" for use, count in inventory.geoms.items() if count)
     lines = {
@@ -193,9 +215,7 @@ def print_inventory(inventory: Inventory, contact: str) -> None:
         lines["contact stiffness"] = (
             f"{least} to {most} kN/m at the tool, which {sank} ({_CONTACTS[contact]})"
         )
-    if inventory.bounces:
-        each = (f"{one.names}, e at most {one.e:.2g}" for one in inventory.bounces)
-        lines["bounces"] = f"{'; '.join(each)} ({_BOUNCES[contact]})"
+    lines |= _blow_lines(inventory, contact, tap)
     is_met = inventory.rows is None or inventory.geoms[MEETS_TOOL] > 0
     if inventory.possible_pairs and not inventory.flexes and not is_met:
         lines["contact"] = (
@@ -407,7 +427,7 @@ class Check:
         is_sound = all(fault.is_note for fault in faults)
         if not self.as_json:
             print_case(case)
-            print_inventory(inventory, case.contact)
+            print_inventory(inventory, case.contact, case.tap)
             print_cost(cost)
             print_faults(faults, is_urdf=b"<robot" in source.sources[0].data)
             if is_sound:
@@ -481,6 +501,7 @@ def _facts(
         "period_s": case.period,
         "contact": case.contact,
         "inventory": asdict(inventory),
+        "tap": None if case.tap is None else asdict(case.tap),
         "faults": [asdict(fault) | {"is_note": fault.is_note} for fault in faults],
         "cost": None if cost is None else asdict(cost),
     }

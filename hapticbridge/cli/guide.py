@@ -57,14 +57,16 @@ def page(topic: str) -> str:
         found = [name for name in topics if topic.lower() in page(name).lower()]
         headed = [name for name in found if any(topic.lower() in h.lower() for h in headings(name))]
         lead = "the word is in" if topic and found else "choose one of"
-        lead = "a heading with the word is in" if topic and headed else lead
+        lead = "the word is explained in" if topic and headed else lead
         advice = f"{lead} {choices(headed or found or topics)}"
     raise HapticBridgeError(f"the guide has no topic '{topic}'; {advice}")
 
 
 def headings(topic: str) -> list[str]:
-    """Returns the headings of a page."""
-    return [line.lstrip("# ") for line in page(topic).splitlines() if line.startswith("#")]
+    """Returns the headings of a page, and the words of the glossary."""
+    lines = page(topic).splitlines()
+    words = [line.split("|")[1] for line in lines if line.startswith("|") and topic == "glossary"]
+    return [line.lstrip("# ") for line in lines if line.startswith("#")] + words
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ import numpy as np
 from rich.markup import escape
 
 from hapticbridge.arguments import option, shared
+from hapticbridge.check.perception import tap_words
 from hapticbridge.cli.terminal import (
     compiling,
     err,
@@ -124,11 +125,10 @@ def announce(setup: RunSetup, named: Mapping[str, float], *, is_method_chosen: b
             "way (--no-probe)"
         )
     if setup.impact_pulses:
-        frequency, decay = setup.pulse
+        (frequency, decay), tap = setup.pulse, setup.tap()
         err.print(
             f"  a blow of the tool gives a pulse of {frequency:g} Hz that falls to 37 % in "
-            f"{format_si(decay, 's')}; for it the device has {setup.pulse_damping:.3g} N s/m more "
-            "than the coupling needs"
+            f"{format_si(decay, 's')}; {tap_words(tap)}"
         )
     _announce_damping(setup, named)
     _announce_own_rate(setup)

@@ -89,6 +89,7 @@ class Certification:
         law_evaluations: Evaluations of the law per tick.
         unanswered: Axes of which the probe could not tell the direction, by name.
         own_loop: Account of a loop of the device's own; None without one.
+        has_guarantee: True if the rendering method lets no scene create energy.
     """
 
     standing: Standing
@@ -99,6 +100,7 @@ class Certification:
     law_evaluations: int = 1
     unanswered: str = ""
     own_loop: OwnLoopAccount | None = None
+    has_guarantee: bool = True
 
     def to_dict(self) -> dict[str, Any]:
         """Returns standing, time and energy by name, for JSON."""
@@ -135,7 +137,8 @@ class Certification:
             limits = "" if open_steps is None else f"; its encoder's steps are {open_steps.word}"
             limits += f", but {self.energy.limit}" if self.energy.limit else ""
             limits += self._untold
-            return f"device certified{self.kept.clause}: b >= {self._bound}{self._if}{limits}"
+            lead = "device certified" if self.has_guarantee else "device bears the coupling"
+            return f"{lead}{self.kept.clause}: b >= {self._bound}{self._if}{limits}"
         if self.verdict is None:
             return f"device not judged: {_OPEN[self.standing]}{self.kept.slowness}"
         return f"device not certified: {self._cause}"
@@ -276,6 +279,7 @@ def certification_of(
         parameters.law_evaluations,
         times.unanswered,
         own_loop,
+        method.has_guarantee,
     )
 
 

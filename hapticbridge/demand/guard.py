@@ -20,6 +20,7 @@ from hapticbridge.device.registry import DRIVERS
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.jit import direct
+from hapticbridge.kernel.law import STOPPED_TWIST
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, OFF, GuardParameters
 from hapticbridge.kernel.tick_guard import FARTHEST
 
@@ -41,9 +42,9 @@ USUAL_STRETCH = 0.2
 """Stretch limit in m of the device's motion; no hand at a desk goes that far from its tool. A
 smaller limit stops users who pull on a stuck tool; a larger one misses a lost tool."""
 
-USUAL_ANGLE = 2.8
+USUAL_ANGLE = STOPPED_TWIST
 """Angle limit in rad. At π the coupling's torque changes sign; 160 degrees leave room for one
-tick."""
+tick. Without a limit, or with a larger one, the handle slips before (``kernel.law.slip``)."""
 
 USUAL_ENERGY = 0.04
 """Energy limit in J, given to the device beyond the hand's own work: 10 N over 4 mm, a nudge and no
@@ -73,6 +74,7 @@ class Limits:
         stretch: Largest distance between handle and tool divided by the scale, in m; beyond it the
             run is stopped.
         angle: Largest angle between handle and tool in rad, below pi; beyond it the run is stopped.
+            With a limit above 2.8, or a device that answers late, the handle slips at 2.5 before.
         energy: Largest energy in J that the hand may get beyond what it put in and what the scene's
             storage gave. The storage is that of all bodies together: what bodies lose beside the
             tool may pass from motors to the hand on top. A wrench that would pass the limit is not

@@ -41,7 +41,7 @@ d is the stated delay, and a tick more of a real device, whose force is computed
 passes. Positions are those that were read: an encoder's steps Δ blur the bound by Δ/2 Σ ‖Δp‖.
 
 There is no pulse while a sample is missing, the passivity controller or the watch acts, or the
-lever is 0. Force and pulse together keep the force limit; the pulse yields.
+lever is 0. Force and pulse together keep the force limit and the energy limit; the pulse yields.
 
 References:
     Okamura, Cutkosky & Dennerlein 2001, IEEE/ASME Trans. Mechatronics 6 (the decaying sinusoid);
@@ -69,7 +69,7 @@ from hapticbridge.kernel.law import felt, owe
 from hapticbridge.kernel.ledger import opened_by_mocap
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
 from hapticbridge.kernel.parameters import SENT, RunParameters
-from hapticbridge.kernel.passivity_controller import largest_power
+from hapticbridge.kernel.passivity_controller import largest_power, share_within_energy_limit
 from hapticbridge.kernel.pose import (
     Vector,
     add,
@@ -84,10 +84,6 @@ from hapticbridge.kernel.restitution import BLOW_SPEED
 from hapticbridge.kernel.rigid_contact import MAX_ROWS, note_ends
 from hapticbridge.kernel.tick_guard import within_limit
 
-FASTEST = 10.0
-"""Largest speed in m/s of a device whose guard has no limit of speed. No arm is faster; a larger
-value makes pulses weaker where no damping is spare."""
-
 FORGOTTEN = 1e-12
 """Energy in J of the account that is dropped. It is less than rounding."""
 
@@ -98,17 +94,14 @@ _CAUTION = SWINGING | RUNS_AWAY | PROBED
 
 IMPACT_DTYPE = np.dtype(
     [
-        ("is_on", "<i8"),
         ("late_ticks", "<i8"),
         ("age", "<i8"),
         ("share", "<f8"),
         ("angle", "<f8"),
         ("rate", "<f8"),
-        ("forgets", "<f8"),
         ("spare", "<f8"),
         ("speed", "<f8"),
         ("account", "<f8"),
-        ("earned", "<f8"),
         ("taken", "<f8"),
         ("held", "<f8"),
         ("work", "<f8"),
@@ -125,11 +118,11 @@ IMPACT_DTYPE = np.dtype(
     ]
 )
 """Sub-record ``impact``, written by this module alone. ``share`` is σ, ``angle`` 2π f T in rad,
-``rate`` T/τ, ``forgets`` 1 − exp(−T/τ), ``spare`` b_s in N s/m, ``speed`` v in m/s and
-``late_ticks`` d. ``age`` is j, −1 without a pulse. ``account`` is B in J, ``earned`` all that it
-got, ``taken`` what the scene gave for it in J, ``work`` Σ p·δp; ``held`` the largest pulse in N
-that the device may hold, ``amplitude`` A in N, ``direction`` n in the device's frame, ``newest``
-the pulse of this tick and ``sent`` those of the last ticks in N. ``blow_energy`` is the W of all
+``rate`` T/τ, ``spare`` b_s in N s/m, ``speed`` v in m/s and ``late_ticks`` d. ``age`` is j, −1
+without a pulse. ``account`` is B in J, ``taken`` what the scene gave for it, of which it got q
+times as much, ``work`` Σ p·δp; ``held`` the largest pulse in N that the device may hold,
+``amplitude`` A in N, ``direction`` n in the device's frame, ``newest`` the pulse of this tick and
+``sent`` those of the last ticks in N. ``blow_energy`` is the W of all
 blows of the tick, ``normal`` the sum of their normals times W in the scene's frame; of the largest
 blow W, the speed −v_n in m/s, the coefficient of restitution that its contact asks for, and
 v⁺/(−v_n)."""
@@ -138,13 +131,11 @@ v⁺/(−v_n)."""
 def bind_pulse(impact: Part, parameters: RunParameters) -> None:
     """Fills in the sub-record; without ``impact_pulses`` it notes blows alone."""
     period = parameters.period
-    impact["is_on"] = parameters.impact_pulses > 0.0
     impact["share"] = parameters.impact_pulses
     impact["angle"] = 2.0 * math.pi * parameters.pulse_frequency * period
     impact["rate"] = period / parameters.pulse_decay
-    impact["forgets"] = -math.expm1(-period / parameters.pulse_decay)
     impact["spare"] = parameters.pulse_damping
-    impact["speed"] = min(parameters.guarding.speed, FASTEST)
+    impact["speed"] = parameters.pulse_speed
     impact["late_ticks"] = parameters.pulse_ticks
     impact["age"] = -1
 
@@ -217,7 +208,7 @@ def earn(s: State) -> float:
         Energy in J of the scene that the tank does not get.
     """
     impact = s.impact
-    if impact.blow_energy <= 0.0 or not impact.is_on:
+    if impact.blow_energy <= 0.0 or impact.share == 0.0:
         return 0.0
     burned = max(s.contact.last_energy - s.energy.environment_energy, 0.0)
     energy = impact.share * min(impact.blow_energy, burned)
@@ -225,9 +216,7 @@ def earn(s: State) -> float:
     size = norm(normal)
     if energy <= 0.0 or size == 0.0:
         return 0.0
-    at_hand = s.run.force_scale / s.run.scale * energy
-    impact.account += at_hand
-    impact.earned += at_hand
+    impact.account += s.run.force_scale / s.run.scale * energy
     impact.taken += energy
     impact.age = 0
     store_vector(impact.direction, device_from_scene(s.run.axes, scaled(1.0 / size, normal)))
@@ -288,7 +277,7 @@ def charge_pulses(s: State, moved: Vector, elapsed: float) -> None:
         impact.account = 0.0
     free = impact.account - _to_come(s)
     if free > 0.0:
-        impact.account -= free * impact.forgets if free > FORGOTTEN else free
+        impact.account -= free * -math.expm1(-impact.rate) if free > FORGOTTEN else free
 
 
 @compiled
@@ -320,34 +309,36 @@ def _affordable(s: State) -> float:
 
 
 @compiled
-def _largest_force(impact: Part, power: float) -> float:
-    """Returns the largest force in N with R(p, 1 s) up to a power in W."""
-    force = 2.0 * math.sqrt(impact.spare * power)
-    if impact.spare > 0.0 and force <= 2.0 * impact.spare * impact.speed:
+def largest_pulse(power: float, spare: float, speed: float) -> float:
+    """Returns the largest pulse p in N with R(p, 1 s) up to a power in W, for b_s and v."""
+    force = 2.0 * math.sqrt(spare * power)
+    if spare > 0.0 and force <= 2.0 * spare * speed:
         return force
-    return float(power / impact.speed + impact.spare * impact.speed)
+    return float(power / speed + spare * speed)
 
 
 @compiled
-def add_pulse(s: State, force: Vector) -> Vector:
+def add_pulse(s: State, force: Vector, torque: Vector) -> Vector:
     """Returns the force on the device in N with the pulse of this tick, and notes the pulse."""
     impact, tick = s.impact, s.loop.tick
-    if not impact.is_on:
+    if impact.share == 0.0:
         return force
     sent = (0.0, 0.0, 0.0)
     is_held = s.loop.external_flags & STALE_SAMPLE or s.guard.lever == 0.0
     if is_held or s.observer.flags & CONTROLLER_ACTIVE or s.watch.flags & _CAUTION:
         impact.age = -1
     if impact.age >= 0:
-        most = _largest_force(impact, max(_affordable(s), 0.0) / s.run.period)
+        power = max(_affordable(s), 0.0) / s.run.period
+        most = largest_pulse(power, impact.spare, impact.speed)
         if impact.age == 0:
             impact.amplitude = most
         envelope = math.exp(-impact.rate * impact.age)
         size = impact.amplitude * envelope * math.cos(impact.angle * impact.age) * s.guard.lever
         wanted, _ = felt(s, scaled(min(max(size, -most), most), vector_of(impact.direction)), sent)
         whole = within_limit(force, add(force, wanted), s.run.force_limit)
-        sent = subtract(whole, force)
-        force = whole
+        if share_within_energy_limit(s, whole, torque) == 1.0:
+            sent = subtract(whole, force)
+            force = whole
         impact.age = impact.age + 1 if envelope > FADED else -1
     store_vector(impact.newest, sent)
     store_vector(impact.sent[tick % SENT], sent)

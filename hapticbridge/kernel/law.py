@@ -11,8 +11,9 @@ of the scene evaluate this law inside MuJoCo's step; ``law_wrench`` evaluates it
 poses that resulted. The two agree because the actuators are implicit: MuJoCo solves them at the end
 of the step.
 
-In four cases the handle's end of the spring moves without the device: it slips. These are changed
-gains, a late sample or wrench, an axis without motor, and a hand that is let go (``slip``). With
+In five cases the handle's end of the spring moves without the device: it slips. These are changed
+gains, a late sample or wrench, an axis without motor, a hand that is let go, and a large twist
+(``slip``). With
 gains that change from tick to tick, the identity behind Brown & Colgate's (6) has the term −Σ W_k
 with W_k = V_k(p_k) − V_{k−1}(p_k), p_k = h_k − x_{k−1} and V the energy of the spring. A raised
 gain would hand W_k to the device, so the handle slips toward the tool until V_k(p'_k) =
@@ -84,7 +85,7 @@ COUPLING_DTYPE = np.dtype(
         ("lacks_motor", "<f8", 6),  # 1 for an axis of the device without motor
         ("owed", "<f8", 2),  # energy in J that late samples and wrenches gave to the springs
         ("tool_then", "<f8", 7),  # tool's pose after the tick of the device's last new sample
-        ("late_ticks", "<i8"),  # d, ticks from a sample to its force
+        ("late_ticks", "<i8"),  # d, ticks from a sample to its force, within which it acts
         ("sent", "<f8", (SENT, 10)),  # lever, wrench on the tool and turn of the last ticks
         ("hold", "<f8", 2),
         ("idle", "<f8", 2),
@@ -94,6 +95,11 @@ COUPLING_DTYPE = np.dtype(
 """Sub-record ``coupling``, written by this module alone. ``hold`` is the most force in N and torque
 in N m along axes without motor, ``idle`` those while the hand is let go. ``twist_damping`` in
 N m s/rad, seen at the tool, is the damping that pays for a torque across the motion."""
+
+LARGEST_TWIST, STOPPED_TWIST = 2.5, 2.8
+"""Twist in rad from which the handle slips that a hand holds behind a late device, or in a run that
+is not stopped at the second. They leave 0.64 and 0.34 rad for the turns of one tick to half a turn,
+where the torque reverses. Larger ones leave less."""
 
 _GAINS = 10  # numbers per actuator in actuator_gainprm and actuator_biasprm (mjNGAIN, mjNBIAS)
 
@@ -157,6 +163,8 @@ def bind_coupling(coupling: Part, parameters: RunParameters, gains: tuple[float,
     coupling["idle"] = guarding.idle_force, guarding.idle_torque
     coupling["twist_damping"] = guarding.twist_damping * parameters.scale / parameters.force_scale
     late = whole_ticks(guarding.stated_delay, parameters.period)
+    # another program's tool may jump before a wrench acts that is sent in time
+    late = max(late, int(parameters.credit > 0.0))
     coupling["late_ticks"] = min(late, SENT - 1)
 
 
@@ -645,10 +653,20 @@ def felt(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
 def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     """Slips the handle toward the tool, where the spring holds more than it may.
 
-    Four things make it slip. A late sample or wrench is charged (``charge_lateness``,
+    Five things make it slip. A late sample or wrench is charged (``charge_lateness``,
     ``charge_lag``). A raised gain must not raise the spring's energy. Along an axis without motor
     the coupling holds up to ``hold`` and then slips. While the hand is let go it relaxes to
-    ``idle``. Each only shortens the spring, so energy is lost and none is gained.
+    ``idle``. A twist ends at ``LARGEST_TWIST`` where no limit stops the run, and behind a late
+    device. Each only shortens the spring, so energy is lost and none is gained.
+
+    **Derivation of the last.** Up to half a turn V(φ) = ½ K_r ‖φ‖² is convex along every turn, and
+    its torque changes by at most K_r ‖δφ‖ beside the turn of its direction, which ``charge_lag``
+    pays. At φ = π the torque K_r φ becomes −K_r φ at once, while V stays. A hand that comes across
+    by δ and back, with the torque of a time t before, gets 2 K_r π δ − b_r δ²/t each way: at most
+    (K_r π)² t/b_r, a power of (K_r π)²/b_r for every t > 0. So no damping bears it, behind any
+    device whose torque does not act at the instant of its sample, of known delay or not. A tool
+    that comes across by δ gets K_r π δ from the midpoint form, in time too. A missing sample alone
+    is borne: the torque that is held is of before, and the hand pays it.
 
     Args:
         s: The bound state, with the handle's new and the tool's old pose.
@@ -661,6 +679,8 @@ def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     k = s.coupling
     linear, angular = springs(s)
     stretch, twist = pulled(s)
+    if s.guard.has_hand and (k.late_ticks > 0 or s.guard.max_angle > STOPPED_TWIST):
+        max_twist = min(max_twist, LARGEST_TWIST)
     if k.owed[0] > 0.0 or k.owed[1] > 0.0:
         length, k.owed[0] = _paid(linear, norm(stretch), k.owed[0])
         angle, k.owed[1] = _paid(angular, norm(twist), k.owed[1])

@@ -36,6 +36,14 @@ def _mask(default: int = 0) -> Any:
     return option(default, least=0, most=2**MAX_BUTTONS - 1)
 
 
+SHORTEST_DECAY, LONGEST_DECAY = 1e-4, 1.0
+"""Time constants in s that a pulse may have. A shorter one ends within a tick of any loop, a longer
+one is no pulse but a push."""
+
+FASTEST = 10.0
+"""Largest speed in m/s of a device whose guard has no limit of speed. No arm is faster; a larger
+value makes pulses weaker where no damping is spare."""
+
 SENT = 64
 """Ticks of which what was sent is kept; a device is at most 50 samples late."""
 
@@ -249,6 +257,15 @@ class StepTimes:
         return (self.period if self.credit else self.scene_period) / self.substeps
 
 
+SEVERAL_HANDS = "several hands hold the scene; pulses need one hand"
+"""Reason to refuse pulses."""
+
+
+def no_pulses(share: float, reason: str) -> HapticBridgeError:
+    """Returns the refusal of pulses with a share of the blows' energy, for a reason."""
+    return HapticBridgeError(f"impact-pulses is {share:g}, but {reason}")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunParameters(StepTimes):
     """All numbers besides scene and device motion that the results of a run depend on.
@@ -326,7 +343,7 @@ class RunParameters(StepTimes):
     loop_period: float = option(0.0, unit="s", least=0.0)
     impact_pulses: float = option(0.0, least=0.0, most=1.0)
     pulse_frequency: float = option(0.0, unit="Hz", least=0.0)
-    pulse_decay: float = option(0.01, unit="s", least=0.0, is_open=True)
+    pulse_decay: float = option(0.01, unit="s", least=SHORTEST_DECAY, most=LONGEST_DECAY)
     pulse_damping: float = option(0.0, unit="N s/m", least=0.0)
     pulse_lag: float = option(0.0, unit="s", least=0.0)
 
@@ -365,13 +382,15 @@ class RunParameters(StepTimes):
             raise _no_rotation(self.axes)
 
     def _check_pulses(self) -> None:
-        is_direct = self.has_law and not (self.is_joint or self.scene_ticks or self.is_apart)
-        if not (self.is_rigid and is_direct):
-            raise HapticBridgeError(
-                f"impact_pulses is {self.impact_pulses:g}; pulses need rigid contact, a coupling "
-                "law, a tool held at a site, a scene that steps in every tick, and a device "
-                "without a loop of its own"
-            )
+        for is_so, reason in (
+            (not self.is_rigid, "contact is 'scene'; pulses need rigid contact"),
+            (not self.has_law, "the method has none; pulses need a coupling law"),
+            (self.is_joint, "the hand holds a joint; pulses need a tool that is held at a site"),
+            (self.scene_ticks, "scene-rate is below the rate; pulses need a step in every tick"),
+            (self.is_apart, "the device has a loop of its own; pulses need the bridge's"),
+        ):
+            if is_so:
+                raise no_pulses(self.impact_pulses, reason)
         if self.pulse_frequency > 0.5 / self.period:
             raise HapticBridgeError(
                 f"pulse is of {self.pulse_frequency:g} Hz; it must be at most half the rate, "
@@ -387,6 +406,11 @@ class RunParameters(StepTimes):
     def device_delay(self) -> float:
         """Delay t_d in s that the device states, in whole ticks, rounded up."""
         return whole_ticks(self.guarding.stated_delay, self.period) * self.period
+
+    @property
+    def pulse_speed(self) -> float:
+        """Largest speed in m/s of the device on which pulses count."""
+        return min(self.guarding.speed, FASTEST)
 
     @property
     def pulse_ticks(self) -> int:

@@ -201,8 +201,8 @@ def largest_power(size: float, damping: float, full_speed: float) -> float:
 
 
 @compiled
-def within_energy_limit(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
-    """Scales the wrench down to what a jump to full speed may take out of the next tick.
+def share_within_energy_limit(s: State, force: Vector, torque: Vector) -> float:
+    """Returns the share of a wrench, 0 to 1, that a jump to full speed may take within a tick.
 
         G + T max_u (w − b u) u <= 1.25 G_max,    |u| <= the data sheet's speed; 30 rad/s
 
@@ -211,14 +211,22 @@ def within_energy_limit(s: State, force: Vector, torque: Vector) -> tuple[Vector
     """
     guard, observer = s.guard, s.observer
     if not math.isfinite(guard.max_energy):
-        return force, torque
+        return 1.0
     power = largest_power(norm(force), observer.assumed_damping, guard.full_speed)
     power += largest_power(norm(torque), observer.assumed_rotational_damping, FULL_TURN)
     allowed = AT_FULL_SPEED * guard.max_energy - observer.guarded_energy
     if not s.run.period * power > allowed:  # also for energies that are not numbers
+        return 1.0
+    return float(max(allowed, 0.0) / (s.run.period * power))
+
+
+@compiled
+def within_energy_limit(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
+    """Scales the wrench down to ``share_within_energy_limit``, and flags that it acted."""
+    share = share_within_energy_limit(s, force, torque)
+    if share == 1.0:
         return force, torque
-    observer.flags = CONTROLLER_ACTIVE
-    share = max(allowed, 0.0) / (s.run.period * power)
+    s.observer.flags = CONTROLLER_ACTIVE
     return scaled(share, force), scaled(share, torque)
 
 
@@ -289,7 +297,7 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
         Hannaford & Ryu 2002, eq. (4); Brown & Colgate 1997, eq. (6).
     """
     observer, energy = s.observer, s.energy
-    limit = observer.energy_credit_limit
+    limit, ratio = observer.energy_credit_limit, s.run.force_scale / s.run.scale
     stored = energy.kinetic + energy.potential - energy.start_energy
     given = energy.environment_energy + s.impact.taken
     over = given - (energy.slack + energy.others_slack)
@@ -297,7 +305,7 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     observer.created_energy = max(created, -limit)
     observer.previous_created = over
     net = stored - energy.actuator_work - energy.external_work - energy.others_work
-    gained = (s.run.force_scale / s.run.scale) * (net - observer.previous_net_storage)
+    gained = ratio * (net - observer.previous_net_storage)
     observer.previous_net_storage = net
     # before the first tick and in a pause, the time that the device took to move is unknown
     rate = 1.0 / interval if s.loop.tick > s.guard.start_tick else 0.0
@@ -325,10 +333,10 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     observer.hand_energy += delivered - unfelt
     observer.max_hand_energy = max(observer.max_hand_energy, observer.hand_energy)
     released = observer.springs - max(given, 0.0) - energy.coupling_work
-    paid = (s.run.force_scale / s.run.scale) * max(released, 0.0)
+    paid = ratio * max(released, 0.0)
     if s.run.is_apart:  # its tank holds what the scene released, until the hand has got it
         observer.most_paid = paid = max(observer.most_paid, paid)
-    unpaid = observer.hand_energy - paid - min(s.impact.work, s.impact.earned)
+    unpaid = observer.hand_energy - paid - min(s.impact.work, ratio * s.impact.taken)
     observer.max_unpaid_energy = max(observer.max_unpaid_energy, unpaid)
     if observer.first_unpaid < 0 and observer.max_unpaid_energy > INSTANT:
         observer.first_unpaid = s.loop.tick

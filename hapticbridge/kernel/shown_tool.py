@@ -38,10 +38,19 @@ hold at the force level, F²/2K + F_r²/2K_r, at the present gains.
 
 A device that answers late holds the force from before a jump of y for longer. What its condition
 counts on is ½ K ‖δh − δy‖² in each tick (``theory.bounds.minimum_damping``), of which the above
-leaves ½ K ‖δh‖². So behind a delay the coupling gives what it gives to any scene, P = f·δy + τ·δφ,
-where that is not more. It may be more where a twist passes half a turn, because V is not convex
-there. So it does before another program, whose tool may jump in every tick, and a wrench is always
-sent some time after its sample.
+leaves ½ K ‖δh‖². So behind a delay the coupling gives what it gives to any scene, f·δy, which V, of
+e along lines, always releases. A twist φ is no such length. If the tool turns across it, V_r falls
+by less, and the torque's change Δτ is larger than K_r δφ. So for rotation
+
+    P_r = min(τ·δφ, V_r before − V_r after − ‖Δτ‖²/2K_r + τ_d·δφ)
+
+in J, with Δτ the change of K_r φ at its level while the tool turns, in N m, and τ_d what the damper
+adds. With a torque that is d ticks late the hand gets Δτ·δφ_h, at most ‖Δτ‖²/2K_r + ½ K_r ‖δφ_h‖²,
+for each of d turns of the tool, on any way: the first is in P_r, b_r pays the second, as along
+lines. What the handle's own turns change is in ``law.slip``. That needs the handle to begin each of
+its turns at less than half a turn: the tool is shown within ``LARGEST_TWIST`` of it. All this holds
+before another program, too, whose tool may jump in every tick, and a wrench is always sent some
+time after its sample.
 
 Another program may step the scene and post the tool's pose when it has one, at any rate. Without a
 velocity the tool is led to the posted pose within the time between the last two posts. Nothing is
@@ -65,8 +74,9 @@ from hapticbridge.kernel.force_level import limited_wrench
 from hapticbridge.kernel.handle import device_from_scene, grip_pose, note_tool, scene_from_device
 from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import (
+    LARGEST_TWIST,
+    Spring,
     energy_at_level,
-    held_energy,
     law_wrench,
     length_at,
     limited,
@@ -469,11 +479,16 @@ def _outside(shown: Part, position: Vector, orientation: Quaternion, time: float
 
 
 @compiled
-def _stored(s: State, position: Vector, orientation: Quaternion) -> float:
-    """Returns V, the energy in J that the coupling's springs hold with the tool at a pose."""
+def _pulled(s: State, position: Vector, orientation: Quaternion) -> tuple[Vector, Vector]:
+    """Returns the coupling's stretch in m and twist in rad with the tool at a pose."""
     stretch = subtract(vector_of(s.pose.handle_position), position)
-    twist = rotation_between(orientation, quaternion_of(s.pose.handle_quaternion))
-    return held_energy(s, stretch, twist)
+    return stretch, rotation_between(orientation, quaternion_of(s.pose.handle_quaternion))
+
+
+@compiled
+def _is_late(s: State) -> bool:
+    """Returns True if a wrench may act after the tool has jumped."""
+    return bool(s.shown.is_posted or s.timing.device_delay_ns > 0)
 
 
 @compiled
@@ -486,35 +501,65 @@ def _shown_at(
     position = add(vector_of(s.pose.tool_position), moved)
     orientation = canonical(product(quaternion_exp(turned), last))
     handle = vector_of(s.pose.handle_position), quaternion_of(s.pose.handle_quaternion)
+    twist = rotation_between(orientation, handle[1])
+    if _is_late(s) and norm(twist) > LARGEST_TWIST:
+        back = subtract(twist, within(twist, LARGEST_TWIST))
+        orientation = canonical(product(quaternion_exp(back), orientation))
+        turned = rotation_between(last, orientation)
     force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
     force, torque = limited_wrench(s, force, torque)
     return position, orientation, force, torque, moved, turned
 
 
 @compiled
-def _released_energy(s: State, before: float, share: float, step: Vector, turn: Vector) -> float:
+def _released(
+    spring: Spring, before: Vector, after: Vector, u: Vector, motion: Vector, is_late: bool
+) -> float:
+    """Returns the part of P in J that one spring has.
+
+    Args:
+        spring: That of translation or of rotation.
+        before: Stretch in m or twist in rad before the tool's motion.
+        after: The same after it.
+        u: Force in N or torque in N m after it, with the damper's.
+        motion: The tool's motion in m, or its rotation vector in rad.
+        is_late: True if the wrench may act after the motion.
+    """
+    elastic = limited(spring, scaled(spring.stiffness, after))
+    released = spring_energy(spring, norm(before)) - spring_energy(spring, norm(after))
+    released += dot(subtract(u, elastic), motion)
+    if not is_late:
+        return released
+    if spring.stiffness > 0.0:
+        change = subtract(elastic, limited(spring, scaled(spring.stiffness, before)))
+        released -= 0.5 * dot(change, change) / spring.stiffness
+    return min(released, dot(u, motion))
+
+
+@compiled
+def _released_energy(
+    s: State, before: tuple[Vector, Vector], share: float, step: Vector, turn: Vector
+) -> float:
     """Returns P, the energy in J that the coupling gives if the tool moves by a share."""
     position, orientation, force, torque, moved, turned = _shown_at(s, share, step, turn)
-    work = dot(force, moved) + dot(torque, turned)
-    linear, angular = springs(s)
-    stretch = subtract(vector_of(s.pose.handle_position), position)
-    twist = rotation_between(orientation, quaternion_of(s.pose.handle_quaternion))
-    elastic = limited(linear, scaled(linear.stiffness, stretch))
-    elastic_r = limited(angular, scaled(angular.stiffness, twist))
-    damped = dot(subtract(force, elastic), moved) + dot(subtract(torque, elastic_r), turned)
-    exact = before - _stored(s, position, orientation) + damped
-    return float(min(exact, work) if s.shown.is_posted or s.timing.device_delay_ns > 0 else exact)
+    (linear, angular), is_late = springs(s), _is_late(s)
+    stretch, twist = _pulled(s, position, orientation)
+    by_force = _released(linear, before[0], stretch, force, moved, is_late)
+    return by_force + _released(angular, before[1], twist, torque, turned, is_late)
 
 
 @compiled
 def _paid_share(
-    s: State, before: float, motion: tuple[Vector, Vector], ends: tuple[float, float]
+    s: State,
+    before: tuple[Vector, Vector],
+    motion: tuple[Vector, Vector],
+    ends: tuple[float, float],
 ) -> tuple[float, float]:
     """Returns a share of a motion that the tank pays for, and its P in J.
 
     Below the force level P is a parabola of the share, a r − c r², so P/r is a line. Where the
-    line's root cannot be, smaller shares are tried. ``ends`` has P of the whole motion and the
-    least P.
+    line's root cannot be, smaller shares are tried. ``before`` is stretch and twist before the
+    motion, and ``ends`` has P of the whole motion and the least P.
     """
     step, turn = motion
     last_released, least = ends
@@ -551,7 +596,7 @@ def shown_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
     last = quaternion_of(pose.tool_quaternion)
     step = subtract(goal, vector_of(pose.tool_position))
     turn = rotation_between(last, orientation)
-    before = _stored(s, vector_of(pose.tool_position), last)
+    before = _pulled(s, vector_of(pose.tool_position), last)
     share, least = 1.0, -max(shown.tank, 0.0)
     work = _released_energy(s, before, share, step, turn)
     if work < least:

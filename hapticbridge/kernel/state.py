@@ -84,7 +84,7 @@ from hapticbridge.kernel.ledger import (
 )
 from hapticbridge.kernel.lossless import LOSSLESS_DTYPE, bind_lossless, note_twist, restart_lossless
 from hapticbridge.kernel.mujoco_c import MJ_DTYPE, forget_warnings, model_addresses
-from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.parameters import SEVERAL_HANDS, RunParameters, no_pulses
 from hapticbridge.kernel.passivity_controller import (
     OBSERVER_DTYPE,
     bind_observer,
@@ -494,9 +494,7 @@ class BoundHands:
                     "scene that steps in every tick"
                 )
             if each.impact_pulses > 0.0:
-                raise HapticBridgeError(
-                    f"impact_pulses is {each.impact_pulses:g}; it must be 0 with several hands"
-                )
+                raise no_pulses(each.impact_pulses, SEVERAL_HANDS)
             if (each.period, each.is_rigid) != (parameters[0].period, parameters[0].is_rigid):
                 raise HapticBridgeError("all hands of a scene need one period and one contact")
         self.state = np.zeros(len(parameters), STATE_DTYPE)

@@ -514,6 +514,8 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     is_last = substep + 1 == s.run.substeps
     if scheme not in (Scheme.MASSLESS, Scheme.SHOWN):
         meter_ports(s)
+    if s.impact.share > 0.0 or (s.contact.bounces and s.contact.rebound_ratio > 0.0):
+        note_blows(s)
     if count == 1 and not is_last:
         end_mocap_moves(s)
         return OK
@@ -521,8 +523,6 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
         note_contacts(s)
     force, torque, moved, turned = _evaluate(state, is_last)
     end_mocap_moves(s)
-    if s.impact.is_on or (s.contact.bounces and s.contact.rebound_ratio > 0.0):
-        note_blows(s)
     if s.contact.is_rigid:
         finish_contacts(s)
     work = s.shown.work if scheme == Scheme.SHOWN else dot(force, moved) + dot(torque, turned)
@@ -619,7 +619,7 @@ def _render(s: State, force: Vector, torque: Vector) -> None:
         force, torque = scaled(lever, force), scaled(lever, torque)
     force, torque = send_within(s, (force, torque), control(s, force, torque))
     force, torque = within_energy_limit(s, force, torque)
-    force = add_pulse(s, force)
+    force = add_pulse(s, force, torque)
     store_vector(s.loop.wrench_on_device[0:3], force)
     store_vector(s.loop.wrench_on_device[3:6], torque)
     note_sent(s)

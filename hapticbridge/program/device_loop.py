@@ -187,7 +187,7 @@ class DeviceLoop:
         self._socket: socket.socket | None = None
         self._heard = 0.0
         self._applied, self._shown = np.zeros(6), np.zeros(7)
-        self._is_closed, self._placed = False, 0
+        self._is_closed = False
         self._is_stranger = self._is_absent = self._has_warned = False
         self.summary: dict[str, Any] = {}
 
@@ -463,16 +463,16 @@ class DeviceLoop:
 
     def _handle_in(self, state: np.void) -> tuple[Array, Array]:
         """Returns pose and velocity of the handle; until it is placed, those that it will have."""
-        if int(state["placed"]) < self._placed:
-            return self._shown, np.zeros(6)
+        if state["placed"] < self._call["placed"][0]:
+            return self._call["place"][0], np.zeros(6)
         return state["handle"], state["velocity"]
 
     def _send_pose(self, *, is_placed: bool) -> None:
-        """Sends the pose; one that was placed is placed again until the loop has heard of it."""
-        is_pending = int(self._state["placed"]) < self._placed
-        self._send(Call.PLACE if is_placed or is_pending else Call.SHOW)
+        """Sends the pose, and with it where the tool was put last: that message may be lost."""
         if is_placed:
-            self._placed = int(self._call["sequence"][0])
+            self._call["placed"] = self._call["sequence"] + 1
+            self._call["place"] = self._call["post"]["pose"]
+        self._send(Call.SHOW)
 
     def _send(self, call: Call) -> None:
         self._call["sequence"] += 1

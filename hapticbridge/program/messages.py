@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.kernel.record import POST_DTYPE
 
-VERSION = 2
+VERSION = 3
 """Version of the datagrams; both sides must have the same one."""
 
 TAG = 16
@@ -35,17 +35,15 @@ class Call(IntEnum):
 
     Attributes:
         GREET: It is there, and has nothing to show yet.
-        SHOW: Its tool has moved.
-        PLACE: Its tool was put somewhere, and the handle belongs there.
+        SHOW: Its tool has moved, or was put somewhere, where the handle belongs, too.
         ADVANCE: Simulated time may go on by a number of ticks.
         LEAVE: It ends.
     """
 
     GREET = 0
     SHOW = 1
-    PLACE = 2
-    ADVANCE = 3
-    LEAVE = 4
+    ADVANCE = 2
+    LEAVE = 3
 
 
 CALL_DTYPE = np.dtype(
@@ -55,12 +53,14 @@ CALL_DTYPE = np.dtype(
         ("sequence", "<i8"),
         ("call", "<i8"),
         ("ticks", "<i8"),
+        ("placed", "<i8"),
+        ("place", "<f8", 7),
         ("post", POST_DTYPE),
     ]
 )
 """From the program to the loop: a random number that stands for the program, number of its call,
-what it is (``Call``), ticks of simulated time (of LEAVE, 1 if an exception ends it), and the tool
-as shown last."""
+what it is (``Call``), ticks of simulated time (of LEAVE, 1 if an exception ends it), number of the
+newest call that put the tool somewhere, the pose there, and the tool as shown last."""
 
 STATE_DTYPE = np.dtype(
     [
@@ -86,12 +86,12 @@ STATE_DTYPE = np.dtype(
     ]
 )
 """From the loop to the program: the program that is meant, number of the message, of the newest
-ADVANCE and a PLACE that are done, 1 at the end of the run and 2 at one by the guard, 1 if the time
-is simulated, tick, bits of the buttons, share of the wrench that is sent (0 while the handle does
-not follow), T in s, what the tank has for the hand in J, how far the device's grip axis is closed
-in m (NaN without one), the handle's pose and velocity in the program's frame, the wrench on the
-device in N and N m, the requested K, B, K_r, B_r, the coupling's levels on the tool in N and N m,
-and why the run ended."""
+ADVANCE and of the call that put the tool somewhere that are done, 1 at the end of the run and 2 at
+one by the guard, 1 if the time is simulated, tick, bits of the buttons, share of the wrench that is
+sent (0 while the handle does not follow), T in s, what the tank has for the hand in J, how far the
+device's grip axis is closed in m (NaN without one), the handle's pose and velocity in the program's
+frame, the wrench on the device in N and N m, the requested K, B, K_r, B_r, the coupling's levels on
+the tool in N and N m, and why the run ended."""
 
 
 def packed(record: NDArray[np.void], token: bytes) -> bytes:

@@ -21,6 +21,7 @@ from hapticbridge.kernel.record import Timeline, force_on_hand
 from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
 from hapticbridge.recording.ring import MAX_CONTACTS
+from hapticbridge.replay.blow import NewestBlow, newest_blow
 
 PLACE = 1e-4
 """Largest distance in m between the tool, simulated again, and its record. It is less than a pixel.
@@ -55,6 +56,7 @@ _PALE, _RED = np.array([0.75, 0.87, 0.98]), np.array([0.70, 0.15, 0.12])
 _GHOST = (0.1, 0.37, 0.71, 0.45)
 _HAND = (0.90, 0.38, 0.0, 1.0)
 _CONTACT = (0.30, 0.82, 0.88, 1.0)
+_BLOW = (0.98, 0.80, 0.10, 0.8)
 
 
 # Forces and their owners: on the hand, on the tool, in contacts
@@ -72,21 +74,36 @@ def peak_forces(rows: NDArray[np.void], axes: ArrayLike) -> tuple[float, float]:
 
 
 def contacts_of(
-    model: mujoco.MjModel, data: mujoco.MjData, parameters: RunParameters
+    model: mujoco.MjModel, data: mujoco.MjData, parameters: RunParameters, *, of_tool: bool = False
 ) -> NDArray[np.float64]:
     """Returns position in m and force in N of contacts in the world frame, (n, 2, 3).
 
     Contacts without a force are left out: MuJoCo also lists pairs within their geoms' gap. A tool
-    without mass has none, because MuJoCo solves for no force there.
+    without mass has none, because MuJoCo solves for no force there. ``of_tool`` leaves out those
+    that the tool, rigid with the grip, has no part in.
     """
     contacts: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
-    wrench = np.zeros(6)
+    wrench, tool = np.zeros(6), model.body_weldid[held_body(model, parameters.grip)]
     for index in range(data.ncon if parameters.properties.has_tool_mass else 0):
+        if of_tool and tool not in model.body_weldid[model.geom_bodyid[data.contact.geom[index]]]:
+            continue
         mujoco.mj_contactForce(model, data, index, wrench)
         if wrench[:3].any() and len(contacts) < MAX_CONTACTS:
             frame = data.contact.frame[index].reshape(3, 3)
             contacts.append((data.contact.pos[index].copy(), frame.T @ wrench[:3]))
     return np.array(contacts, dtype=np.float64).reshape(len(contacts), 2, 3)
+
+
+def place_of_blow(contacts: NDArray[np.float64], row: NDArray[np.void]) -> NDArray[np.float64]:
+    """Returns the position in m of the contact with the largest force, (3,).
+
+    Args:
+        contacts: Position in m and force in N of each contact, (n, 2, 3).
+        row: Record of the tick; without a contact it gives the position of the grip.
+    """
+    if not len(contacts):
+        return np.array(row["tool_position"], dtype=np.float64)
+    return np.asarray(contacts[np.linalg.norm(contacts[:, 1], axis=1).argmax(), 0])
 
 
 def force_colour(force: float, reference: float) -> NDArray[np.float64]:
@@ -118,6 +135,7 @@ class Stage:
         row: Record of that tick, one element of ``TICK_DTYPE``; of several hands, the first's.
         rows: Records of that tick, one per hand.
         passed: Records after the tick shown before and before this one.
+        blow: Newest blow of the tool up to that tick; None before the first.
         hand_force: Force of the device on the hand at that tick, (3,) in N in the scene's frame;
             zero for a prescribed motion, which no hand feels.
         hand_reference: Largest force on the hand in the run, in N, or ``MIN_REFERENCE``.
@@ -157,6 +175,7 @@ class Stage:
         self._at = 0  # index within the block
         self.rows = self._block[0]
         self.row = self.passed = self._block[:1, 0]
+        self.blow: NewestBlow | None = None
         self._is_held = [is_held(each.meta) for each in hands]
         hand, tool = zip(
             *(
@@ -205,9 +224,15 @@ class Stage:
                 self._block, self._at = next(self._rest), 0
             end = min(len(self._block), self._at + tick + 1 - self._run.done)
             recorded = self._block[self._at : end]
+            # the scene is at a blow's contact in the tick of the blow alone
+            end = self._at + _first(recorded[:, 0]["blow_energy"] > 0.0)
+            recorded = recorded[: end - self._at]
             again = self._run.add(recorded if self.recording.has_several_hands else recorded[:, 0])
             self._refuse_another_run(recorded, again.reshape(-1, len(self._hands)))
             passed.append(recorded[:, 0])
+            contacts = contacts_of(self.model, self._run.data, self.parameters, of_tool=True)
+            place = place_of_blow(contacts, recorded[-1, 0])
+            self.blow = newest_blow(self.blow, recorded[:, 0], place)
             self._at, self.rows, self.row = end, recorded[-1], recorded[-1:, 0]
         self.passed = np.concatenate(passed) if passed else self.row
         mujoco.mj_copyData(self.data, self.model, self._run.data)
@@ -262,6 +287,16 @@ class Stage:
             tip = place + force * (MAX_ARROW * extent / strongest)
             _add(scene, mujoco.mjtGeom.mjGEOM_ARROW, _CONTACT, between=(place, tip), size=size)
 
+    def add_blow(self, scene: mujoco.MjvScene) -> None:
+        """Draws the place of the newest blow, with its energy and pulse, for ``SHOWN``."""
+        if self.blow is None or not self.blow.is_marked(1e-9 * float(self.row["deadline_ns"][0])):
+            return
+        size = 0.02 * self.model.stat.extent
+        sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+        mark = _add(scene, sphere, _BLOW, position=self.blow.place, size=size)
+        if mark is not None:  # MuJoCo's letters are those of ASCII
+            mark.label = self.blow.words.replace("µ", "u")
+
     def add_coupling(self, scene: mujoco.MjvScene) -> None:
         """Draws handle, coupling and the force on each hand into a scene made from ``data``.
 
@@ -284,6 +319,11 @@ class Stage:
             tip = handle + force * (MAX_ARROW * self.model.stat.extent / self.hand_reference)
             arrow = mujoco.mjtGeom.mjGEOM_ARROW
             _add(scene, arrow, _HAND, between=(handle, tip), size=0.5 * size)
+
+
+def _first(is_true: NDArray[np.bool_]) -> int:
+    """Returns the length up to and with the first true one; the whole length if there is none."""
+    return int(is_true.argmax()) + 1 if is_true.any() else len(is_true)
 
 
 HEADLIGHT_AMBIENT, HEADLIGHT_DIFFUSE = 0.4, 0.6
@@ -340,9 +380,10 @@ def _add(
     size: float,
     position: ArrayLike = (0.0, 0.0, 0.0),
     between: tuple[ArrayLike, ArrayLike] | None = None,
-) -> None:
+) -> mujoco.MjvGeom | None:
+    """Draws a shape; returns None if the scene is full."""
     if scene.ngeom >= scene.maxgeom:
-        return
+        return None
     geom = scene.geoms[scene.ngeom]
     mujoco.mjv_initGeom(
         geom,
@@ -358,6 +399,7 @@ def _add(
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR
     geom.emission = GLOW
     scene.ngeom += 1
+    return geom
 
 
 class Camera:
@@ -402,6 +444,7 @@ class Camera:
         self.renderer.update_scene(self._stage.data, self._camera, self._shown)
         if self._has_forces:
             self._stage.add_contacts(self.renderer.scene)
+            self._stage.add_blow(self.renderer.scene)
             self._stage.add_coupling(self.renderer.scene)
         return np.array(self.renderer.render(), dtype=np.uint8)
 

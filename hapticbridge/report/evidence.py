@@ -75,6 +75,7 @@ class Evidence:
         excess: Energy given to the device beyond its dissipation and what scene and coupling
             released, so far, (n,) in J; zeros if it cannot be computed
             (``EnergyBalance.excess_device_energy``).
+        taken: Energy of the scene that blows have paid for pulses so far, (n,) in J.
         model: The compiled scene, in the process that may compile it; else None.
     """
 
@@ -87,6 +88,7 @@ class Evidence:
     created: Array
     allowed: Array
     excess: Array
+    taken: Array
     model: mujoco.MjModel | None = None
 
     @property
@@ -171,7 +173,12 @@ class Evidence:
             balances = energy_balances(blocks, state, run.events, run.delay, work)
             energies = np.concatenate(
                 [
-                    (each.environment_energy, each.slack, each.excess_device_energy)
+                    (
+                        each.environment_energy,
+                        each.slack,
+                        each.excess_device_energy,
+                        each.pulses.taken,
+                    )
                     for _, each in balances
                 ],
                 axis=1,
@@ -188,6 +195,7 @@ class Evidence:
             created=energies[0],
             allowed=energies[1],
             excess=energies[2],
+            taken=energies[3],
         )
 
 
@@ -231,9 +239,8 @@ def blows_of(evidence: Evidence) -> list[Blow]:
     if not struck.size:
         return []
     groups = np.split(struck, np.flatnonzero(np.diff(struck) > 1) + 1)
-    ratio = parameters.impact_pulses * parameters.force_scale / parameters.scale
-    spent = np.maximum(-np.diff(evidence.created, prepend=0.0), 0.0)
-    paid = ratio * np.minimum(ticks["blow_energy"], spent)
+    ratio = parameters.force_scale / parameters.scale
+    paid = ratio * np.diff(evidence.taken, prepend=0.0)
     moved = np.diff(ticks["device_position"], axis=0, append=ticks["device_position"][-1:])
     work = np.sum(ticks["pulse"] * moved, axis=1)
     ends = [group[0] + 1 for group in groups[1:]] + [len(ticks)]

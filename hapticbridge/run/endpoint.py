@@ -70,6 +70,9 @@ LAST_WORDS = 0.3
 LEFT, FAILED = "program", "program that failed"
 """Reasons of a stop, in the recording: the program has left the loop, or an exception has."""
 
+ENDS = {"duration": "its hand's motion is over", "signal": "it was interrupted"}
+"""Why a loop ended by itself, for the program; other reasons speak for themselves."""
+
 TAKEN_OVER = "another program has taken over the device loop; one at a time has it"
 
 _TOOL = """<mujoco model="tool of another program">
@@ -235,7 +238,9 @@ class Endpoint:
         if self._thread.is_alive():
             self._thread.join()
             self._told["is_over"] = 2 if isinstance(error, SafetyTrip) else 1
-            words = "the device loop has ended" if error is None else str(error)
+            by = self._bridge.session.stopped_by
+            ended = f"the device loop has ended: {ENDS.get(by, by)}"
+            words = ended if error is None else str(error)
             self._told["words"] = words.encode()[:WORDS]
             end = time.monotonic() + LAST_WORDS
             while self._peer is not None and time.monotonic() < end:
@@ -284,19 +289,25 @@ class Endpoint:
         elif kind == Call.LEAVE:
             self._peer = None
             self._on_leave(FAILED if call["ticks"] else LEFT)
-        elif kind in (Call.SHOW, Call.PLACE) and is_post(call["post"]):
+        elif kind == Call.SHOW and is_post(call["post"]) and self._place(call):
             post = np.zeros(1, POST_DTYPE)
             post[0] = call["post"]
-            if kind == Call.PLACE and not self._is_absolute:
-                placed = {"event": "reset", "pose": post["pose"][0].tolist(), "by": "program"}
-                waiting = self._bridge.session.commands.waiting
-                if len(waiting) == waiting.maxlen:
-                    return  # or a flood would push a user's command out; it is placed again
-                waiting.append((Repeat((placed,)), "program"))
-            if kind == Call.PLACE and self._told["placed"] == self._placed[0]:
-                self._placed = number, self._bridge.session.tick + 1
             self._scene.post(post)
             self._check_rate()
+
+    def _place(self, call: np.void) -> bool:
+        """Puts handle and tool where a call says, once; returns False if that must wait."""
+        if call["placed"] <= self._placed[0]:
+            return True
+        waiting, placed = self._bridge.session.commands.waiting, np.zeros(1, POST_DTYPE)
+        placed["pose"] = call["place"]
+        if len(waiting) == waiting.maxlen or not is_post(placed[0]):
+            return False  # or a flood would push a user's command out; the next call says it again
+        if not self._is_absolute:
+            reset = {"event": "reset", "pose": call["place"].tolist(), "by": "program"}
+            waiting.append((Repeat((reset,)), "program"))
+        self._placed = int(call["placed"]), self._bridge.session.tick + 1
+        return True
 
     def _check_rate(self) -> None:
         """Warns once of a program that shows its tool much more or less often than was said."""

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, cast
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -31,6 +32,7 @@ from hapticbridge.demand.guard import (
 )
 from hapticbridge.demand.loop_setting import LoopSetting, pulling_loop
 from hapticbridge.demand.methods import (
+    SCENE,
     Contact,
     Method,
     default_method,
@@ -38,6 +40,7 @@ from hapticbridge.demand.methods import (
     require_hazard_consent,
     resolve_contact_stiffness,
 )
+from hapticbridge.demand.pulse import PULSES, USUAL_PULSE, Tap, pulse_of
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.base import calling_on_error
 from hapticbridge.device.own_loop import LoopDevice
@@ -47,25 +50,27 @@ from hapticbridge.errors import (
     HapticBridgeError,
     RecordingError,
     SceneError,
-    choices,
 )
 from hapticbridge.kernel.parameters import (
     MAX_BUTTONS,
     MAX_SCENE_TICKS,
     ROUNDING,
     SAME_AXES,
+    SEVERAL_HANDS,
     SUBSTEPS,
     UNGUARDED,
     GuardParameters,
     RunParameters,
     StepTimes,
+    no_pulses,
     refuse_substeps,
     rotation_numbers,
 )
 from hapticbridge.kernel.pose import IDENTITY_POSE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.realtime import busy_step_time, scene_ticks_for, wants_real_time
 from hapticbridge.run.commands import CouplingLimits
-from hapticbridge.scene import Scene
+from hapticbridge.scene import Scene, custom_text
 from hapticbridge.scene.physics import site_inertia
 from hapticbridge.scene.rehearsal import (
     HOLDING_STEPS,
@@ -75,6 +80,7 @@ from hapticbridge.scene.rehearsal import (
     static_load,
     toppling_force,
 )
+from hapticbridge.scene.softness import largest_restitution
 from hapticbridge.units import format_si
 
 # Options of a user
@@ -190,7 +196,8 @@ class BridgeOptions:
             a short pulse of force on the device: a tap then feels crisp. It needs rigid contact.
             Damping of the device beyond what the coupling needs makes it stronger.
         pulse: Pulse of a blow: 'steel', 'wood' or 'rubber', or HZ,MS for its frequency in Hz and
-            the time in ms in which it falls to 37 %.
+            the time in ms in which it falls to 37 %. 'scene', the default, takes the one that the
+            scene's custom text 'pulse' names, or 'wood'.
         realtime: Request real-time priority and locked memory for the loop, and print what the
             system refuses (see 'hapticbridge doctor'). By default requested for a real device.
         pipelined: Compute ahead, after the wrench was sent, what needs no new sample. The numbers
@@ -219,7 +226,7 @@ class BridgeOptions:
     probe: bool | None = None
     tool_weight: bool = True
     impact_pulses: float = option(0.0, least=0.0, most=1.0)
-    pulse: str = option("wood")
+    pulse: str = option(SCENE)
     realtime: bool | None = None
     pipelined: bool | None = None
     live: bool = option(False, no_flag="a run of the command line shows it on a terminal")
@@ -229,7 +236,8 @@ class BridgeOptions:
         if self.scene_ticks:
             self.rendering_method.refuse_slow()
         refuse_substeps(self.rendering_method.scheme, self.substeps or 1)
-        pulse_of(self.pulse)
+        if self.pulse != SCENE:
+            pulse_of(self.pulse)
         if self.clutch is not None and self.clutch == self.dead_man:
             raise DeviceError(
                 f"clutch and dead-man are both button {self.clutch}; they exclude each other"
@@ -259,6 +267,14 @@ class BridgeOptions:
             rate = own if own < rate * (1.0 - ROUNDING) else rate
         return replace(self, rate=rate)
 
+    def for_scene(self, model: mujoco.MjModel) -> BridgeOptions:
+        """Returns the options with the pulse that the scene names, if blows give pulses."""
+        if self.pulse != SCENE or not self.impact_pulses:
+            return self
+        own = custom_text(model, "pulse") or USUAL_PULSE
+        pulse_of(own, "the scene's custom text 'pulse'")
+        return replace(self, pulse=own)
+
     @property
     def scene_ticks(self) -> int:
         """Ticks between two results of the scene; 0 for every tick, also with "auto".
@@ -287,36 +303,13 @@ class BridgeOptions:
         return method.with_contact(self.contact)
 
 
-PULSES = {"steel": (300.0, 0.011), "wood": (100.0, 0.0125), "rubber": (30.0, 0.0167)}
-"""Frequency in Hz and time constant in s of the pulse of a blow on a material. They are those of
-taps on aluminium, wood and rubber (Okamura, Cutkosky & Dennerlein 2001), rounded; steel rings as
-aluminium does, beyond what a hand tells apart. Others feel like another material."""
-
-
-def pulse_of(text: str) -> tuple[float, float]:
-    """Returns frequency in Hz and time constant in s of a name of ``PULSES`` or of ``HZ,MS``.
-
-    Raises:
-        HapticBridgeError: It is neither.
-    """
-    if text in PULSES:
-        return PULSES[text]
-    try:
-        frequency, decay = (float(part) for part in text.split(","))
-    except ValueError:
-        frequency = decay = math.nan
-    if not (0.0 <= frequency < math.inf and 0.0 < decay < math.inf):
-        raise HapticBridgeError(
-            f"pulse is {shown(text)}; it must be one of {choices(PULSES)}, or HZ,MS such as 250,8"
-        )
-    return frequency, 1e-3 * decay
-
-
 DEFAULT_OPTIONS = BridgeOptions()
 """Options of a bridge without choices of the user."""
 
 
 # Setup of a run
+
+_AT_REST = np.array([((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)], SAMPLE_DTYPE)
 
 STEADY = 0.8
 """Largest K T_s² (1/m_tool + 1/m_hand) of the usual coupling to a slower scene, without unit. The
@@ -510,7 +503,7 @@ class RunSetup(StepTimes):
     is_probed: bool = False
     tool_weight: bool = True
     impact_pulses: float = 0.0
-    pulse: tuple[float, float] = PULSES["wood"]
+    pulse: tuple[float, float] = PULSES[USUAL_PULSE]
     is_realtime: bool = False
     is_pipelined: bool = False
 
@@ -578,7 +571,7 @@ class RunSetup(StepTimes):
             and (info.is_real if options.probe is None else options.probe),
             tool_weight=options.tool_weight,
             impact_pulses=options.impact_pulses,
-            pulse=pulse_of(options.pulse),
+            pulse=pulse_of(USUAL_PULSE if options.pulse == SCENE else options.pulse),
             is_realtime=wants_real_time(options.realtime, clock, is_real=info.is_real),
             is_pipelined=is_real_clock if options.pipelined is None else options.pipelined,
         )
@@ -595,7 +588,12 @@ class RunSetup(StepTimes):
             clutch=button_mask(options.clutch),
             dead_man=button_mask(options.dead_man),
         )
-        return replace(setup, guard=guard)
+        setup = replace(setup, guard=guard)
+        if setup.impact_pulses:
+            if scene.has_several_hands:
+                raise no_pulses(setup.impact_pulses, SEVERAL_HANDS)
+            setup.unloaded(_AT_REST, None)  # refuses what pulses cannot have
+        return setup
 
     @property
     def credit(self) -> float:  # type: ignore[override] # that of the scene
@@ -643,6 +641,15 @@ class RunSetup(StepTimes):
         """Damping in N s/m that the device has for pulses, beyond what the coupling needs."""
         own, _ = self.info.dissipating_damping
         return max((own or 0.0) - self.loop.needs()[0], 0.0) if self.impact_pulses else 0.0
+
+    def tap(self) -> Tap:
+        """Returns a tap of the tool, on the contact of the scene that bounces most.
+
+        The tool counts with its smallest inertia at the grip.
+        """
+        scene, e = self.scene, largest_restitution(self.scene.model)
+        mass = site_inertia(scene.model, scene.data, scene.model.site(scene.grip).id)
+        return Tap.of(self.unloaded(_AT_REST, None), mass, e)
 
     def holding(self, start: NDArray[np.void], effective: Coupling | None) -> RunParameters:
         """Returns the parameters of a run that starts now and whose device can hold the tool.

@@ -90,7 +90,7 @@ class RunRequest:
             as_is=scene.as_is,
             grasps=tuple(replace(grasp, device=info.name) for grasp, info in named),
             devices=tuple(devices),
-            options=options.for_devices(devices),
+            options=options.for_devices(devices).for_scene(scene.model),
             clock=clock.name,
         )
 

@@ -450,11 +450,16 @@ class Summary:
             yield "pulses", f"paid {format_energy(paid)} by blows; they {work_words(worked)}"
         if self.reach is not None:
             yield "reach", f"{format_si(self.reach, 'm')}; beyond, no handle and no force"
+        yield from self._energy_rows()
+
+    def _energy_rows(self) -> Iterator[tuple[str, str]]:
         if scales := self.hand_energy.scales:
             yield "scales", scales
         for name, text in energy_rows(self.energies, self.start_potential, self.credit):
-            of_tank = ", what the program may still give to the hand" if name == "tank" else ""
-            yield name, text + of_tank
+            remark = ", what the program may still give to the hand" if name == "tank" else ""
+            if name == "device energy" and not self.has_hand:
+                remark = ", of forces that were not felt"
+            yield name, text + remark
         so_far = "with the tick that tripped, " if self.trip else ""  # the record is without it
         if self.max_net_energy > INSTANT:
             yield "net to the hand", so_far + self.hand_energy.sentence
@@ -583,7 +588,10 @@ class Summary:
             probe=outcome.probed.words if outcome.probed else "",
             grip=parameters.grip,
             device=info.name,
-            pulses=(float(state["impact"]["earned"][0]), float(state["impact"]["work"][0]))
+            pulses=(
+                parameters.force_scale / parameters.scale * float(state["impact"]["taken"][0]),
+                float(state["impact"]["work"][0]),
+            )
             if parameters.impact_pulses
             else None,
         )

@@ -19,7 +19,8 @@ def custom_text(model: mujoco.MjModel, name: str) -> str:
     """Returns the custom text of a name; empty if the scene has none.
 
     The bridge uses the text ``about``, a sentence that describes the scene, and ``grip_axis``, the
-    joint that a device's grip axis moves. ``grips`` are the grips that several hands hold.
+    joint that a device's grip axis moves. ``grips`` are the grips that several hands hold, and
+    ``pulse`` is the pulse of the tool's blows (``demand.pulse``).
     """
     text_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, name)
     if text_id < 0:

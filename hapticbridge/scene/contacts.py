@@ -245,20 +245,15 @@ def contact_concerns(
     timestep: float,
     *,
     cone: Literal["elliptic", "pyramidal"] = "elliptic",
-    diagexact: bool = True,
     refsafe: bool = True,
-    only_active: bool = False,
 ) -> list[Concern]:
-    """Returns the risks of a contact setting; empty for a recommended setting.
+    """Returns the risks of a contact setting that is likely to exceed the slack; else none.
 
     Args:
         setting: The contact's; ``contact_numbers`` raises the errors.
         timestep: h in s.
         cone: Friction cone; it matters only for condim > 1 and a friction below 0.4.
-        diagexact: True if MuJoCo's exact diagonal is enabled. Without it more runs of the map's
-            shipped setting create energy.
         refsafe: As for ``contact_numbers``.
-        only_active: If true, only risks that are likely to exceed the slack are returned.
 
     Returns:
         Risks whose words follow "the contact of …".
@@ -292,23 +287,6 @@ def contact_concerns(
                 "coupling's slack allows",
                 'cone="elliptic" in <option>, or condim="1" for no friction',
                 is_cone=True,
-            )
-        )
-    if only_active:
-        return concerns
-    if numbers.grade != "strict" and not diagexact:
-        concerns.append(
-            Concern(
-                "is solved with MuJoCo's approximate diagonal, with which more runs created energy",
-                '<flag diagexact="enable"/> in <option>',
-            )
-        )
-    if numbers.resolved > SOFT_STEPS * (1 + ROUNDING):
-        concerns.append(
-            Concern(
-                f"is soft: a steady force sinks in {numbers.softness:.3g} times as deep as with "
-                f'solref="{REFERENCE_STEPS * timestep:g} 1"',
-                f"{instead} unless this is intended",
             )
         )
     return concerns
@@ -347,22 +325,15 @@ def warn_of_contacts(model: mujoco.MjModel, grip: str, scene: object) -> None:
 
 
 def check_contacts(
-    model: mujoco.MjModel,
-    grip: str,
-    *,
-    is_thorough: bool = False,
-    only: Collection[frozenset[int]] | None = None,
+    model: mujoco.MjModel, grip: str, *, only: Collection[frozenset[int]] | None = None
 ) -> list[Concern]:
-    """Returns the concerns about all contacts that the tool can have.
+    """Returns the concerns about all contacts that the tool can have (``contact_concerns``).
 
     Flexes, and the ``solreffriction`` of pairs, are not checked.
 
     Args:
         model: The compiled scene with the time step of the run.
         grip: Name of the site on the tool.
-        is_thorough: If true, soft contacts and the approximate diagonal are reported too; both are
-            MuJoCo's defaults. Otherwise only contacts that are likely to create more energy than
-            the slack allows.
         only: Pairs of geoms to check; None: all that the tool can have.
     """
     option, names_by_setting = model.opt, dict[ContactSetting, list[str]]()
@@ -383,9 +354,7 @@ def check_contacts(
             setting,
             step,
             cone="elliptic" if option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else "pyramidal",
-            diagexact=bool(option.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT),
             refsafe=not option.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE,
-            only_active=not is_thorough,
         )
     ]
 

@@ -343,13 +343,17 @@ _ACTIONS = {
 """Parts of an action, which ``action_dict`` holds in SI units."""
 
 
+STILL = 1e-6
+"""Half a range of an action in m, N or N m below which it is rounding, and no motion to learn."""
+
+
 class RobomimicWriter:
     """Writer of a robomimic data set: ``demos.hdf5`` with a group ``data/demo_K`` per episode.
 
     ``actions`` are from −1 to 1, as robomimic's policies give them: each number a of the whole set
-    is (a − offset)/scale with offset = (max + min)/2 and scale = (max − min)/2, or 1 where nothing
-    changes. ``data`` has the attributes ``action_scale``, ``action_offset`` and ``action_names``;
-    ``action_dict`` of each episode holds the numbers themselves.
+    is (a − offset)/scale with offset = (max + min)/2 and scale = (max − min)/2, or 1 where that is
+    below ``STILL``. ``data`` has the attributes ``action_scale``, ``action_offset`` and
+    ``action_names``; ``action_dict`` of each episode holds the numbers themselves.
 
     Raises:
         RecordingError: h5py is not installed.
@@ -399,7 +403,8 @@ class RobomimicWriter:
         low = np.min([actions.min(axis=0) for actions in self._actions], axis=0)
         high = np.max([actions.max(axis=0) for actions in self._actions], axis=0)
         offset = (0.5 * (low + high)).astype(np.float32)
-        scale = np.where(high > low, 0.5 * (high - low), 1.0).astype(np.float32)
+        half = 0.5 * (high - low)
+        scale = np.where(half >= STILL, half, 1.0).astype(np.float32)
         for number, actions in enumerate(self._actions):
             # rounding may lead a number out by 1e-7
             normalised = np.clip((actions - offset) / scale, -1.0, 1.0)
@@ -490,20 +495,9 @@ def write_dataset(
     return WrittenDataset(folder, tuple(counts), tuple(map(_resets, recordings)))
 
 
-AGAIN = 50
-"""Ticks within which a program that places its tool at the same pose repeats what it has said."""
-
-
 def _placings(recording: RecordingFile) -> list[Mapping[str, Any]]:
     """Returns the resets of a run, and of another program's tool where it was placed anew."""
-    found: list[Mapping[str, Any]] = []
-    for event in recording.events:
-        if event.get("event") == "reset":
-            last = found[-1] if found else {}
-            is_near = event.get("tick", 0) - last.get("tick", -AGAIN) < AGAIN
-            if not (is_near and "pose" in event and event["pose"] == last.get("pose")):
-                found.append(event)
-    return found
+    return [event for event in recording.events if event.get("event") == "reset"]
 
 
 def _placed_at(recording: RecordingFile) -> int:

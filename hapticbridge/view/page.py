@@ -17,6 +17,7 @@ from hapticbridge.demand.methods import RunCoupling
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import printable
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.replay.blow import NewestBlow
 from hapticbridge.replay.stage import MIN_REFERENCE, force_colour, is_held
 from hapticbridge.run.description import method_of, requested_of
 from hapticbridge.scene.physics import matrix_of
@@ -55,13 +56,14 @@ _AXES: tuple[dict[str, Any], ...] = ({"size": 22, **_SMALL}, {"size": 52, "space
 
 _COLOURS_MEAN = (
     "Blue ghost: the handle. Spring: the coupling, {length}, pale at rest, red at {pull} on the "
-    "tool.{hand} Turquoise: contacts and their forces, the longest is {strongest}."
+    "tool.{hand} Turquoise: contacts and their forces, the longest is {strongest}. Yellow: a blow "
+    "of the tool."
 )
 
 _HAND_MEANS = " Orange arrow: the force on the hand, the longest is {longest}."
 
-_CONTACT = (77, 208, 225)
-"""Colour of contacts, red, green and blue of 255."""
+_CONTACT, _BLOW = (77, 208, 225), (250, 204, 26)
+"""Colours of contacts and blows, red, green and blue of 255."""
 
 FARTHEST = 0.25
 """Length of the spring at the longest stretch so far, as a share of the scene's extent."""
@@ -111,6 +113,7 @@ class Sight:
         contact_forces: Forces of the contacts, (n, 3) in N.
         tendons: Straight pieces of each visible tendon, (m, 2, 3) in m.
         others: Further hands with a handle in the scene; a grip axis has none.
+        blow: Newest blow of the tool so far; None before the first.
     """
 
     time: float
@@ -125,6 +128,7 @@ class Sight:
     contact_forces: Array
     tendons: tuple[NDArray[np.float32], ...] = ()
     others: tuple[Held, ...] = ()
+    blow: NewestBlow | None = None
 
     @classmethod
     def from_scene(
@@ -168,8 +172,9 @@ class Sight:
 
     def parts(self) -> list[Any]:
         """Returns numbers and arrays from which ``from_parts`` makes an equal one."""
-        *own, others = [getattr(self, field.name) for field in fields(self)]
-        return [*own, [[getattr(each, field.name) for field in fields(each)] for each in others]]
+        *own, others, blow = [getattr(self, field.name) for field in fields(self)]
+        held = [[getattr(each, field.name) for field in fields(each)] for each in others]
+        return [*own, held, None if blow is None else blow.parts()]
 
     @classmethod
     def from_parts(cls, parts: Any, bodies: int, tendons: int, others: int = 0) -> Sight:
@@ -181,7 +186,7 @@ class Sight:
         """
         try:
             time, places, turns, handle, handle_turn, grip, hand, tool, where, forces, *rest = parts
-            lines, held = rest
+            lines, held, blow = rest
             return cls(
                 float(checked(np.array(time))),
                 checked(places, bodies, 3),
@@ -201,6 +206,7 @@ class Sight:
                     Held(*(checked(own, n) for own, n in zip(each, (3, 4, 3, 3, 3), strict=True)))
                     for each, _ in zip(held, range(others), strict=True)
                 ),
+                None if blow is None else NewestBlow.from_parts(checked(blow, 7)),
             )
         except (TypeError, ValueError) as error:
             raise RecordingError(f"an instant of the run cannot be drawn: {error}") from None
@@ -475,16 +481,19 @@ class Page:
             for ghost, held in zip(self._ghosts, sight.hands, strict=True):
                 ghost.show(held, self.hand_reference, self.tool_reference)
             self._show_contacts(sight)
+            self._show_blow(sight)
         if self._plots:
             self._explain()
 
-    def forces(self, sight: Sight) -> str:
-        """Names the forces of an instant: on the hand, and on the tool where it differs.
+    def facts(self, sight: Sight) -> str:
+        """Names the forces of an instant, and the newest blow of the tool.
 
-        Of several hands, those of the first; the pictures show all.
+        The force on the tool is named where it differs from that on the hand. Of several hands,
+        those of the first; the pictures show all.
         """
         hand = float(np.linalg.norm(sight.hand_force)) if self._is_held else None
-        return format_forces(hand, float(np.linalg.norm(sight.tool_force)))
+        forces = format_forces(hand, float(np.linalg.norm(sight.tool_force)))
+        return forces if sight.blow is None else f"{forces}; {sight.blow.words}"
 
     def plot(self, time: Array, lines: Sequence[Array]) -> None:
         """Draws the curves.
@@ -541,6 +550,8 @@ class Page:
             point_shape="circle",
             visible=False,
         )
+        self._blow = scene.add_icosphere("/blow", 0.03 * extent, _BLOW, opacity=0.8, visible=False)
+        self._blow_words = scene.add_label("/blow/words", "", anchor="bottom-left")
         centre, away = scenery.centre, 1.25 * extent
         self._server.initial_camera.look_at = tuple(centre)
         self._server.initial_camera.position = tuple(centre + away * np.array([0.7, -0.8, 0.6]))
@@ -556,6 +567,14 @@ class Page:
             self._contacts.points = places
             tips = places + reach * sight.contact_forces
             self._pushes.points = np.stack([places, tips], axis=1).astype(np.float32)
+
+    def _show_blow(self, sight: Sight) -> None:
+        blow = sight.blow
+        self._blow.visible = blow is not None and blow.is_marked(sight.time)
+        if blow is not None and self._blow.visible:
+            self._blow.position = blow.place
+            if self._blow_words.text != blow.words:
+                self._blow_words.text = blow.words
 
 
 def _strongest(sight: Sight) -> float:

@@ -29,8 +29,9 @@ from hapticbridge.kernel.record import force_on_hand
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.format import further_hands
 from hapticbridge.recording.recorder_process import listen
-from hapticbridge.recording.ring import Snapshot
-from hapticbridge.replay.stage import MIN_REFERENCE, is_held, tell_apart
+from hapticbridge.recording.ring import Picture, Snapshot
+from hapticbridge.replay.blow import NewestBlow, newest_blow
+from hapticbridge.replay.stage import MIN_REFERENCE, is_held, place_of_blow, tell_apart
 from hapticbridge.run.description import parameters_of
 from hapticbridge.view.controls import Controls, Outlet, add_hand, allowance_of
 from hapticbridge.view.geometry import Scenery, Tendons
@@ -70,6 +71,8 @@ class LiveRun:
         tool_reference: Largest force on the tool in N so far, or ``MIN_REFERENCE``.
         flags: Combined flags of the records so far.
         trace: The curves so far.
+        blow: Newest blow of the tool so far, where the scene's next picture has the largest contact
+            force; None before the first.
     """
 
     def __init__(self, ring: Ring, snapshot: str, run: RecordingFile) -> None:
@@ -88,6 +91,7 @@ class LiveRun:
         self.trace = Trace(TRACE, is_held=self._is_held)
         self.hand_reference = self.tool_reference = MIN_REFERENCE
         self.flags = 0
+        self.blow: NewestBlow | None = None
 
     def look(self) -> Sight | None:
         """Returns the newest instant; None if it was returned before."""
@@ -98,14 +102,14 @@ class LiveRun:
         if number != picture.number or rows.size < len(self._hands):
             return None  # its records are not written yet
         self._shown = number
-        self._gather(picture.slack)
+        self._gather(picture)
         self._data.qpos[:] = picture.qpos
         self._data.mocap_pos[:], self._data.mocap_quat[:] = picture.mocap_pos, picture.mocap_quat
         force = force_on_hand(rows[:1], self.parameters.axes)[0] * self._is_held
         sight = Sight.from_scene(
             self.model, self._data, rows[:1], self._tendons, picture.contacts, force
         )
-        sight = replace(sight, others=tuple(self._others(rows)))
+        sight = replace(sight, others=tuple(self._others(rows)), blow=self.blow)
         for held in sight.hands:
             size, pull = np.linalg.norm(held.hand_force), np.linalg.norm(held.tool_force)
             self.hand_reference = max(self.hand_reference, float(size))
@@ -119,14 +123,15 @@ class LiveRun:
                 row = rows[hand : hand + 1]
                 yield Held.from_record(row, force_on_hand(row, own.axes)[0] * self._are_held[hand])
 
-    def _gather(self, slack: float) -> None:
+    def _gather(self, picture: Picture) -> None:
         """Adds the records since the last call to the curves, which are those of the first hand."""
         number, rows = self._ring.since(self._gathered)
         self._gathered = number + len(rows)
         own = rows[-number % len(self._hands) :: len(self._hands)]
         if own.size:
             self.flags |= int(np.bitwise_or.reduce(rows["flags"]))
-            self.trace.add(own, slack)
+            self.trace.add(own, picture.slack)
+            self.blow = newest_blow(self.blow, own, place_of_blow(picture.contacts, own[-1]))
 
 
 def run_of(metadata: dict[str, str], files: dict[str, bytes]) -> RecordingFile:
@@ -185,7 +190,7 @@ def _follow(
             page.tool_reference = live.tool_reference
             page.show(sight)
             alarm = Alarm.of(live.flags)
-            page.status.content = f"**{sight.time:.1f} s**, {page.forces(sight)}" + (
+            page.status.content = f"**{sight.time:.1f} s**, {page.facts(sight)}" + (
                 f"; **{alarm.sentence}**" if alarm else ""
             )
         now = time.monotonic()

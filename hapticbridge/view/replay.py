@@ -120,7 +120,8 @@ def _played(recording: RecordingFile, worker: Worker) -> None:
         sight = Sight.from_scene(
             stage.model, stage.data, stage.row, tendons, stage.contacts(), stage.hand_force
         )
-        sight = replace(sight, others=tuple(Held.from_record(*each) for each in stage.others()))
+        others = tuple(Held.from_record(*each) for each in stage.others())
+        sight = replace(sight, others=others, blow=stage.blow)
         worker.tell([sight.parts(), trace.newest])
 
 
@@ -165,12 +166,13 @@ class Theatre:
         """Shows the instant nearest to a time in s."""
         sight = self._replay.sight_at(moment)
         self._page.show(sight)
-        self._page.status.content = f"**{sight.time:.3f} s**, {self._page.forces(sight)}"
+        self._page.status.content = f"**{sight.time:.3f} s**, {self._page.facts(sight)}"
 
     def page(self) -> str:
         """Returns a page that plays the run by itself: one document without a server.
 
-        It has the scene, the coupling and the arrows; curves and texts need the server.
+        It has the scene, the coupling, the arrows and the blows; curves and other texts need the
+        server.
         """
         self.show(0.0)
         film = self._server.get_scene_serializer()

@@ -16,7 +16,7 @@ from kernel_runs import T
 from tapping import DAMPING, onset, spectral_error, stiff_onset, tapping
 
 from hapticbridge import Coupling
-from hapticbridge.run.options import PULSES
+from hapticbridge.demand.pulse import PULSES
 
 SPEEDS, STIFFNESSES, SHARES, GAP = (0.1, 0.2, 0.3, 0.4), (1000.0, 2000.0), (0.5, 1.0), 0.06
 """Speeds in m/s, stiffnesses in N/m, shares of a blow's energy, and way to the wall in m."""

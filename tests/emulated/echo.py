@@ -1,39 +1,11 @@
-"""Two small devices that answer with what they were sent: what the bench itself is tested with."""
+"""A small HID device that answers with what it was sent."""
 
 from __future__ import annotations
 
 from emulated.hid_device import HidDevice
-from emulated.usb_device import BULK, Endpoint, Setup, StallError, UsbDevice
 
 VENDOR = 0x1209
 """pid.codes; its products 0001 to 0010 are for tests."""
-
-
-class EchoUsb(UsbDevice):
-    """A vendor device: bulk bytes come back, and so does the value of vendor request 7."""
-
-    vendor, product = VENDOR, 0x0001
-    manufacturer, product_name, serial = "hapticbridge", "bulk echo", "E1"
-    endpoints = (Endpoint(0x81, BULK), Endpoint(0x02, BULK))
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.unread = bytearray()
-
-    def request(self, setup: Setup, data: bytes, now: float) -> bytes:
-        if setup.request != 7:
-            raise StallError
-        return setup.value.to_bytes(2, "little")
-
-    def accept(self, endpoint: int, data: bytes, now: float) -> None:
-        self.unread += data
-
-    def take(self, endpoint: int, length: int, now: float) -> bytes | None:
-        if not self.unread:
-            return None
-        answer = bytes(self.unread[:length])
-        del self.unread[:length]
-        return answer
 
 
 class EchoHid(HidDevice):

@@ -125,11 +125,6 @@ class PyusbBackend(usb.backend.IBackend):  # type: ignore[misc]
     def attach_kernel_driver(self, handle: UsbDevice, interface: int) -> None:
         pass
 
-    def clear_halt(self, handle: UsbDevice, endpoint: int) -> None:
-        with self._changed:
-            self._require(handle)
-            handle.halted.discard(endpoint)
-
     # -- transfers -------------------------------------------------------------------------------
 
     def ctrl_transfer(

@@ -169,10 +169,6 @@ def _checks_in_virtual_time(folder: Path) -> list[Claim]:
     return _checks(folder, "*check_*.py", is_virtual=True)
 
 
-def _round_trips(folder: Path) -> list[Claim]:
-    return _checks(folder, "check_bench.py", "come_back_through", is_virtual=False)
-
-
 def _recorded(
     folder: Path, loops: Mapping[str, float], compiled: Path | None = None
 ) -> tuple[GuestRun, list[Path]]:
@@ -220,7 +216,6 @@ JOBS = (
     Job("C: closed loops", _kernel_missing, _closed_loops),
     Job("C: 1 kHz loop, repeated", _kernel_missing, _the_same_every_time),
     Job("B: checks under umockdev", _umockdev_missing, _under_umockdev),
-    Job("C: round trips on the wall clock", _kernel_missing, _round_trips),
 )
 
 

@@ -235,7 +235,6 @@ class UsbfsClient(Client):
             0x0A: self._submit,
             0x0B: self._discard,
             0x12: lambda *_: -errno.ENODATA,  # take the driver off: there is none
-            0x15: self._clear_halt,
             0x1A: self._capabilities,
             0x1F: lambda *_: device.speed,
         }
@@ -312,10 +311,6 @@ class UsbfsClient(Client):
             return -errno.EPIPE
         self._set_memory(data_address, answer)
         return len(answer) if setup.is_to_host else setup.length
-
-    def _clear_halt(self, address: int, now: float) -> int:
-        self._device.halted.discard(struct.unpack("<I", self._memory(address, 4))[0])
-        return 0
 
     def _capabilities(self, address: int, now: float) -> int:
         # zero packets, transfers of any size

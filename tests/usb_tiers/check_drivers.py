@@ -25,7 +25,7 @@ from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 from usb_tiers import benches
 from usb_tiers.benches import usable_devices, wait_for
-from usb_tiers.conftest import FIRST_FRONT_END, IS_TIME_VIRTUAL, TIER, Plug
+from usb_tiers.conftest import IS_TIME_VIRTUAL, TIER, Plug
 
 PERIOD = 1e-3
 
@@ -86,15 +86,17 @@ def test_a_written_force_moves_a_falcon_as_its_mass_and_damping_say(plug_usb: Pl
         _require_pushed(device)
 
 
-def test_a_written_force_moves_a_home_made_device_alike(plug_hid: Plug) -> None:
-    plug_hid(benches.free_rawhid)
+def test_a_written_force_moves_a_home_made_device_alike(plug_hid_each_way: Plug) -> None:
+    plug_hid_each_way(benches.free_rawhid)
     with closing(_opened("rawhid")) as device:
         _require_pushed(device)
 
 
 @pytest.mark.parametrize("is_odd", [False, True], ids=["usual", "odd"])
-def test_a_written_force_moves_a_force_feedback_stick_alike(plug_hid: Plug, is_odd: bool) -> None:
-    model = plug_hid(lambda: benches.free_stick(is_odd=is_odd))
+def test_a_written_force_moves_a_force_feedback_stick_alike(
+    plug_hid_each_way: Plug, is_odd: bool
+) -> None:
+    model = plug_hid_each_way(lambda: benches.free_stick(is_odd=is_odd))
     with closing(_opened(benches.STICK)) as device:
         _require_pushed(device)
         assert model.call("force") == pytest.approx((FORCE, 0.0), abs=2e-3 * benches.NEWTONS)
@@ -175,8 +177,10 @@ def test_two_home_made_devices_at_once_are_told_apart(plug_hid: Plug) -> None:
 
 
 @pytest.mark.parametrize("has_long_reports", [False, True], ids=["short", "long"])
-def test_a_deflected_spacemouse_moves_the_handle(plug_hid: Plug, has_long_reports: bool) -> None:
-    plug_hid(lambda: SpaceMouse(_deflected, has_long_reports=has_long_reports))
+def test_a_deflected_spacemouse_moves_the_handle(
+    plug_hid_each_way: Plug, has_long_reports: bool
+) -> None:
+    plug_hid_each_way(lambda: SpaceMouse(_deflected, has_long_reports=has_long_reports))
     device = _opened("spacemouse")
     moved = _held(device, 0.3, (0.0, 0.0, 0.0))
     device.close()
@@ -194,7 +198,6 @@ def _still(now: float) -> tuple[float, ...]:
 
 
 @pytest.mark.usefixtures("no_spin")
-@pytest.mark.parametrize("plug_hid", FIRST_FRONT_END, indirect=True)
 def test_a_falcon_turns_the_nut_of_a_bolt_that_a_spacemouse_holds(
     plug_usb: Plug, plug_hid: Plug, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

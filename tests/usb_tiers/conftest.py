@@ -28,9 +28,6 @@ _FRONT_ENDS: dict[str, dict[str, Callable[[Any], FrontEnd]]] = {
     "uml": {"usbip": Usbip, "uhid": Uhid},
 }
 
-FIRST_FRONT_END = tuple(_FRONT_ENDS.get(TIER, {}))[:1]
-"""The first way of ``plug_hid`` in this tier, for a check that takes long."""
-
 IS_TIME_VIRTUAL = os.environ.get("HAPTICBRIDGE_TIME") == "virtual"
 """True if time passes only while everything waits; then times can be asserted."""
 
@@ -62,9 +59,15 @@ def plug_usb() -> Iterator[Plug]:
     yield from _plugging(Umock if TIER == "umock" else Usbip)
 
 
+@pytest.fixture
+def plug_hid() -> Iterator[Plug]:
+    """Plugs in a HID device, over USB where the tier has it."""
+    yield from _plugging(next(iter(_FRONT_ENDS[TIER].values())))
+
+
 @pytest.fixture(params=_FRONT_ENDS.get(TIER, {}))
-def plug_hid(request: pytest.FixtureRequest) -> Iterator[Plug]:
-    """Plugs in a HID device, in each way that the tier has."""
+def plug_hid_each_way(request: pytest.FixtureRequest) -> Iterator[Plug]:
+    """Plugs in a HID device in each way that the tier has, also without USB, as by Bluetooth."""
     yield from _plugging(_FRONT_ENDS[TIER][request.param])
 
 

@@ -92,10 +92,10 @@ def exact_response(
     return position, mass * acceleration
 
 
-def exact_records(coupling: Coupling, grid: float, mass: float = DRIVEN_MASS) -> NDArray[np.void]:
+def exact_records(coupling: Coupling, grid: float) -> NDArray[np.void]:
     """Returns the records of an exact simulation at whole multiples of ``grid`` s."""
     count = round(DRIVEN_DURATION / grid)
-    x, force = exact_response(coupling.stiffness, coupling.damping, mass, grid, count)
+    x, force = exact_response(coupling.stiffness, coupling.damping, DRIVEN_MASS, grid, count)
     angle, torque = exact_response(
         coupling.rotational_stiffness, coupling.rotational_damping, DRIVEN_INERTIA, grid, count
     )

@@ -458,7 +458,6 @@ class SceneMotion(Staged):
         coupling: K and B.
         grid: Longest period T in s.
         finest: Shortest period T in s.
-        refinement: Ratio of ``finest`` to the reference's step.
 
     Raises:
         HapticBridgeError: The scene cannot be read, or there is no hand path beside it.
@@ -470,7 +469,6 @@ class SceneMotion(Staged):
         coupling: Coupling,
         grid: float,
         finest: float,
-        refinement: int = REFINEMENT,
     ) -> None:
         first = load_scene(scene)
         motion = motion_for(first)
@@ -489,7 +487,7 @@ class SceneMotion(Staged):
         stages = Stages(
             lambda: Prepared(load_scene(scene), path_of(motion, self.speed), duration, coupling)
         )
-        self._limits = OwnReferences(stages, grid, finest, duration, refinement)
+        self._limits = OwnReferences(stages, grid, finest, duration, REFINEMENT)
         super().__init__(coupling, stages, self._limits)
         pace = "" if self.speed == 1 else f", {self.speed:.3g} times as fast"
         self.about = f"the scene's own hand path, {duration:g} s of it{pace}"
@@ -497,7 +495,7 @@ class SceneMotion(Staged):
             Panel(
                 "moving",
                 f"{self.name} along its hand path{pace}",
-                f"the same method at a step {refinement} times smaller than the smallest: "
+                f"the same method at a step {REFINEMENT} times smaller than the smallest: "
                 "convergence, not truth",
                 is_truth=False,
             ),

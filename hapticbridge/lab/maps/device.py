@@ -145,13 +145,12 @@ def settle(
     return "cycle", last, run
 
 
-def pressed_device(beta: float, sigma: float, limit: float = 10.0) -> SimulatedDevice:
+def pressed_device(beta: float, sigma: float) -> SimulatedDevice:
     """Returns a device with friction and encoder steps whose hand presses it on the wall.
 
     Args:
         beta: b/(K T), without unit, >= 0.
         sigma: f_c/(K Δ), without unit, >= 0.
-        limit: Limit of its data sheet, in N and N m.
     """
     return SimulatedDevice(
         mass=DEVICE_MASS,
@@ -160,8 +159,8 @@ def pressed_device(beta: float, sigma: float, limit: float = 10.0) -> SimulatedD
         resolution=RESOLUTION,
         hand=base.STEADY_HAND,
         path=base.pressing((0.02, PRESSED * QUANTUM)),
-        force_limit=limit,
-        torque_limit=limit,
+        force_limit=10.0,
+        torque_limit=10.0,
     )
 
 

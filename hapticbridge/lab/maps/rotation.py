@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -64,7 +64,7 @@ def gyroscopic_speed(stiffness: float) -> float:
     return float(np.sqrt(2 * np.pi * stiffness / (INERTIA.max() - INERTIA.min())))
 
 
-def free_creation(speed: float, ticks: int = TICKS) -> float:
+def free_creation(speed: float) -> float:
     """Returns the energy in J that the explicit gyroscopic term creates in a free tool.
 
     With the term at the start of the step, v⁺ = v − T I⁻¹(ω × Iω), the kinetic energy grows by
@@ -73,15 +73,11 @@ def free_creation(speed: float, ticks: int = TICKS) -> float:
 
     a step, since ω·(ω × Iω) = 0. Summed over the exact motion (fourth order) from a spin about
     ``OBLIQUE``. Beyond a few per cent of the kinetic energy, the created energy increases the spin,
-    and the true creation is larger.
-
-    Args:
-        speed: Speed in rad/s.
-        ticks: Number of ticks.
+    and the true creation is larger. ``speed`` is in rad/s.
     """
     omega = speed * OBLIQUE / np.linalg.norm(OBLIQUE)
     total = 0.0
-    for _ in range(ticks):
+    for _ in range(TICKS):
         torque = np.cross(omega, INERTIA * omega)
         total += 0.5 * PERIOD**2 * float(np.sum(torque**2 / INERTIA))
         first = _torque_free(omega)
@@ -339,16 +335,7 @@ def evaluate(point: Point) -> Mapping[str, float | int | str]:
         motion = sudden(method, stiffness, speed)
     else:
         motion = spin(method, coupling, speed, angle=angle)
-    return {
-        "ticks": motion.ticks,
-        "environment": motion.environment,
-        "created": motion.created,
-        "slack_share": motion.slack_share,
-        "first_active": motion.first_active,
-        "largest_angle": motion.largest_angle,
-        "crossed": motion.crossed,
-        "torque_jump": motion.torque_jump,
-    }
+    return asdict(motion)
 
 
 STYLES = {0.0: "s:", SOFT: "o-", HARD: "^--"}

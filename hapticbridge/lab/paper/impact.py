@@ -33,12 +33,12 @@ COLOURS: dict[Law, str] = {"newton": "C3", "poisson": "C0", "stronge": "C2"}
 _Array = NDArray[np.float64]
 
 
-def _stepped(law: Law, steps: int = 20_000) -> float:
+def _stepped(law: Law) -> float:
     """Integrates Coulomb's law in small steps of P_n; returns the energy change in J."""
     a, d, g = (float(value) for value in ROD.compliance())
     v_t, v_n = VELOCITY
     impulse = compression = work = taken = energy = 0.0
-    step = 1.0 / steps
+    step = 1.0 / 20_000
     while True:
         # the friction that would stop the slip within this step, bounded by Coulomb's cone
         tangential = float(np.clip((g * step - v_t) / a, -FRICTION * step, FRICTION * step))

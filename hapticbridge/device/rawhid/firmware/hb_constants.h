@@ -29,6 +29,7 @@ static const int HB_TRIALS = 8;
 static const float HB_NEAR = 0.999999f;
 static const float HB_SLOWEST = 0.25f;
 static const float HB_LONGEST = 3.0f;
+static const float HB_LARGEST_TWIST = 2.5f;
 static const float HB_SPEED_STEP = 0.001f;
 static const float HB_TURN_STEP = 0.001f;
 

@@ -123,9 +123,6 @@ struct HbReport {
 // one along lines: what half a radian lacks is 1 % of what a late force counts on.
 static const float HB_FLAT = 0.25f;
 
-// Largest twist in rad between the shown tool and the handle.
-static const float HB_LARGEST_TWIST = 2.5f;
-
 // How well the timer keeps the period.
 struct HbPace {
   uint32_t ticks;           // periods so far

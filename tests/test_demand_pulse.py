@@ -1,0 +1,91 @@
+"""Presets of pulses, and the largest pulse that a device can answer a tap with."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from kernel_runs import T, load
+from tapping import COUPLING, SPARE, parameters_of, tapping, towards, wall
+
+from hapticbridge.check.perception import FORCE_FLOOR, tap_words
+from hapticbridge.demand.pulse import PULSES, TAP_SPEED, Tap, pulse_of
+from hapticbridge.device.simulated.device import SimulatedDevice
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.options import BridgeOptions
+
+MASS = 0.1
+"""Mass of the tapping tool in kg."""
+
+
+def parameters(**changes: Any) -> RunParameters:
+    return replace(parameters_of(load(wall()), **changes), coupling=COUPLING)
+
+
+@pytest.mark.parametrize("spare", [SPARE, 0.5, 0.0])
+@pytest.mark.parametrize("share", [1.0, 0.25])
+def test_a_tap_is_answered_as_strongly_as_it_says(spare: float, share: float) -> None:
+    how: dict[str, Any] = {"pulse_damping": spare, "impact_pulses": share, "force_limit": 50.0}
+    taps = tapping(**how)
+    for _ in range(400):
+        taps.tick(towards(TAP_SPEED))
+    tap = Tap.of(parameters(**how), MASS, 0.0)
+    blows = taps.ticks["blow_energy"]
+    first = int(np.flatnonzero(blows)[0])
+    assert blows[first : first + 5].sum() == pytest.approx(tap.burned, rel=0.25)
+    assert np.abs(taps.ticks["pulse"]).max() == pytest.approx(tap.pulse, rel=0.25)
+
+
+def test_a_late_device_and_a_bounce_make_the_answer_weaker_and_the_force_limit_ends_it() -> None:
+    tap = Tap.of(parameters(), MASS, 0.0)
+    assert tap.burned == pytest.approx(0.5 * MASS * TAP_SPEED**2)
+    assert tap.pulse == pytest.approx(2.0 * math.sqrt(SPARE * tap.burned / T))
+    late = Tap.of(parameters(guarding={"stated_delay": 3 * T}), MASS, 0.0)
+    assert late.pulse == pytest.approx(tap.pulse / 2.0)
+    assert Tap.of(parameters(), MASS, 0.6).burned == pytest.approx(0.64 * tap.burned)
+    assert Tap.of(parameters(force_limit=1.0), MASS, 0.0).pulse == 1.0
+
+
+def test_words_of_a_tap_say_what_is_spare_and_what_is_too_weak() -> None:
+    felt = Tap(0.2, 0.0, 1e-3, 0.3, FORCE_FLOOR)
+    assert "0.3 N s/m more damping" in tap_words(felt)
+    assert "too weak" not in tap_words(felt)
+    unfelt = tap_words(replace(felt, spare=0.0, pulse=0.99 * FORCE_FLOOR))
+    assert "too weak to be felt; the device has no damping to spare" in unfelt
+
+
+def test_names_and_numbers_of_pulses() -> None:
+    assert pulse_of("steel") == PULSES["steel"]
+    assert pulse_of("250,8") == (250.0, 0.008)
+    assert pulse_of("0,0.1") == (0.0, 1e-4)
+    wrong = ("gold", "250", "250,0", "-1,8", "nan,8", "1,2,3", "1e-400,1e-320", "9,0.09", "9,1001")
+    for text in wrong:
+        with pytest.raises(HapticBridgeError, match=r"pulse is .*; it must be one of .* HZ,MS"):
+            BridgeOptions(pulse=text)
+
+
+def test_a_scene_names_its_pulse_and_the_option_overrides_it(tmp_path: Path) -> None:
+    def pulse(text: str, **options: Any) -> tuple[float, float]:
+        custom = f'<custom><text name="pulse" data="{text}"/></custom>'
+        scene = tmp_path / "wall.xml"
+        scene.write_text(wall().replace("</mujoco>", f"{custom if text else ''}</mujoco>"))
+        setup = Bridge(scene, SimulatedDevice(), **options).setup
+        return setup.pulse
+
+    assert pulse("steel", impact_pulses=1.0) == PULSES["steel"]
+    assert pulse("60,10", impact_pulses=1.0) == (60.0, 0.01)
+    assert pulse("steel", impact_pulses=1.0, pulse="rubber") == PULSES["rubber"]
+    assert pulse("", impact_pulses=1.0) == PULSES["wood"]
+    assert pulse("a heart's") == PULSES["wood"]  # a run without pulses does not read it
+    with pytest.raises(HapticBridgeError, match=r"custom text 'pulse' is 'gold'; it must be one"):
+        pulse("gold", impact_pulses=1.0)
+
+
+def test_the_hammer_rings_like_steel() -> None:
+    assert Bridge("hammer", SimulatedDevice(), impact_pulses=1.0).setup.pulse == PULSES["steel"]
