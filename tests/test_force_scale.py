@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -139,7 +140,8 @@ def test_a_bar_gets_nothing_from_two_handles_of_one_ratio(
     [
         (SAME, FIVE, "is 1 for the hand at 'left' and 5 for that at 'right'"),
         (FIVE, SAME, "is 5 for the hand at 'left' and 1 for that at 'right'"),
-        (SAME, Workspace(force_scale=1.001), "is 1 for the hand at 'left' and 1.001 for that at"),
+        (SAME, Workspace(force_scale=1.00001), "is 1 for the hand at 'left' and 1.00001 for that"),
+        (Workspace(scale=0.3, force_scale=0.7), Workspace(scale=0.9), "is 2.333333333 for the"),
     ],
 )
 def test_hands_between_which_energy_would_be_multiplied_are_refused(
@@ -151,10 +153,9 @@ def test_hands_between_which_energy_would_be_multiplied_are_refused(
         hb.Bridge(scene, held(bar, left, right), clock=hb.SimulatedClock())
     alike = left.energy_ratio * right.scale
     assert f"force_scale / scale {words}" in str(refused.value)
-    assert str(refused.value).endswith(
-        f"let them be equal, as with force_scale {alike:g} at 'right'"
-    )
-    mended = Workspace(scale=right.scale, force_scale=alike)
+    [told] = re.findall(r"equal, as with force_scale (.*) at 'right'$", str(refused.value))
+    assert float(told) == pytest.approx(alike, rel=1e-9)
+    mended = Workspace(scale=right.scale, force_scale=float(told))
     hb.Bridge(scene, held(bar, left, mended), clock=hb.SimulatedClock())
 
 
@@ -216,6 +217,18 @@ def test_a_hand_gets_the_ratio_times_what_the_scene_had_stored_and_the_run_says_
         got[ratio] = bar.got
     assert "gave the hand up to 728 mJ, 5 times the 146 mJ that it released" in str(summary)
     assert got[5.0] > 2.0 * STORED > 2.0 * got[1.0]
+
+
+def test_what_another_hand_put_in_is_not_told_as_the_scenes_storage(tmp_path: Path) -> None:
+    scene, path = scene_at(tmp_path, SLIDER.format(spring="")), tmp_path / "run.mcap"
+    hands = [Grasp("left", End(Bar(1.0, push=5.0))), Grasp("right", End(Bar(1.0, brake=20.0)))]
+    with hb.Bridge(scene, hands, clock=hb.SimulatedClock(), recording=path) as bridge:
+        summary = bridge.run(0.3)
+    shared, _, right = str(summary).partition("hand at 'right'")
+    assert "gave the hand" not in shared
+    assert re.search(r"\n  scene and hands +gave the hand \d+(\.\d+)? mJ", right)
+    told = "the scene's storage or another hand at 'right' gave the hand"
+    assert told in hb.audit(path, in_process=True).reason
 
 
 def test_the_works_of_ports_count_as_the_hand_gets_them() -> None:

@@ -240,7 +240,9 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
         of = f": it needs at most {NEEDED_SHARE:.0%} of b, in every scene"
     out.print(f"use {sentence}{of}")
     own_loop = f"--device-damping {z.device_damping:g} --loop-rate HZ --loop-delay SECONDS"
-    out.print(f"a loop on the device's own board bears more: 'hapticbridge bound {own_loop}'")
+    out.print(
+        f"a faster loop on the device's own board bears more: 'hapticbridge bound {own_loop}'"
+    )
     if command is None:
         out.print(
             "'hapticbridge run' has no low-pass: leave --filter-time out for a run's coupling"
@@ -298,7 +300,7 @@ _COUNTED = "--friction with --resolution counts them"
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Compute the device damping that a coupling needs, or the stiffest coupling of a device.
+    """Compute the device damping that a coupling needs.
 
     Without --stiffness it is the coupling that 'run' chooses for the device, or for the numbers in
     its place. Alternative laws are listed beside it. K and B are the requested ones; the law of the
@@ -308,8 +310,8 @@ class Bound:
     Examples:
         hapticbridge bound --stiffness 2000 --damping 1 --rate 1000
         hapticbridge bound --stiffness 2000 --damping 1 --device simulated:damping=3
-        hapticbridge bound --device-damping 2 --friction 0.1 --resolution 1e-5 --loop-rate 1e4
-            --loop-delay 1e-5
+        hapticbridge bound --device-damping 2 --friction 0.1 --resolution 1e-5
+        hapticbridge bound --device-damping 2 --loop-rate 1e4 --loop-delay 1e-5
     """
 
     stiffness: float | None = shared(Coupling, "stiffness", None)

@@ -271,9 +271,9 @@ def _refuse_unequal_energies(setups: Sequence[RunSetup]) -> None:
         if not math.isclose(own, others.energy_ratio, rel_tol=_EQUAL):
             alike = others.energy_ratio * workspace.scale
             raise HapticBridgeError(
-                f"force_scale / scale is {others.energy_ratio:.4g} for the hand at '{first}' and "
-                f"{own:.4g} for that at '{grip}': what one puts in would come out at the other "
-                f"multiplied; let them be equal, as with force_scale {alike:.4g} at '{grip}'"
+                f"force_scale / scale is {others.energy_ratio:.10g} for the hand at '{first}' and "
+                f"{own:.10g} for that at '{grip}': what one puts in would come out at the other "
+                f"multiplied; let them be equal, as with force_scale {alike:.10g} at '{grip}'"
             )
 
 

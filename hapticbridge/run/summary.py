@@ -390,7 +390,7 @@ class Summary:
             for name, text in each._rows():
                 is_got = name == "device energy" and each.energies["device_energy"] > INSTANT
                 origin = ", put in by other hands" if is_got and not each.max_net_energy else ""
-                shown = "scene, other hands" if name == _STORAGE else name
+                shown = "scene and hands" if name == _STORAGE else name
                 if name in _OF_A_HAND:
                     yield f"  {shown:<{_NAME_WIDTH - 2}}{text}{origin}"
             yield from (f"  {line}" for line in (*each._coupling_lines(), *each._device_lines()))
