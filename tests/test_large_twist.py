@@ -105,7 +105,7 @@ def test_a_hand_that_trembles_across_half_a_turn_gains_nothing(
 
 
 def test_a_tool_that_spins_gains_nothing_at_half_a_turn() -> None:
-    """In time, too: there the midpoint torque did work, and its spring held no less."""
+    """The midpoint torque did work there, in time too, and its spring held no less."""
     still = trembles(0.0, 0.0, 1)
     spinning: dict[str, Any] = {"method": "lossless", "inertia": 1e-2, "speed": 50.0}
     assert in_scene(still, 0.0, **spinning) < NOTHING

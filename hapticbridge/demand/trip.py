@@ -76,7 +76,10 @@ _REMEDIES = {
         "that falls or tips over), and springs or motors of the scene that push it beyond the "
         "force limit; with another reach in mind raise --stretch-limit"
     ),
-    TripCode.TWISTED: "turn more slowly, or raise --rotational-stiffness if the device bears it",
+    TripCode.TWISTED: (
+        "turn more slowly, raise --rotational-stiffness if the device bears it, or let the handle "
+        "slip on instead: --angle-limit inf"
+    ),
     TripCode.GAVE_ENERGY: "lower --stiffness",
     TripCode.CONTACTS_FULL: codes.WARNING_REMEDIES[codes.CONTACTS_FULL],
     TripCode.CONSTRAINTS_FULL: codes.WARNING_REMEDIES[codes.CONSTRAINTS_FULL],

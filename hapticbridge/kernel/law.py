@@ -666,7 +666,8 @@ def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     (K_r π)² t/b_r, a power of (K_r π)²/b_r for every t > 0. So no damping bears it, behind any
     device whose torque does not act at the instant of its sample, of known delay or not. A tool
     that comes across by δ gets K_r π δ from the midpoint form, in time too. A missing sample alone
-    is borne: the torque that is held is of before, and the hand pays it.
+    is borne: the torque that is held is of before, and the hand pays it. In time, a limit of the
+    angle of at most ``STOPPED_TWIST`` stops a run before.
 
     Args:
         s: The bound state, with the handle's new and the tool's old pose.
