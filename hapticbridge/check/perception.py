@@ -140,8 +140,10 @@ def _vector_part(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.f
 # Felt taps
 
 
-def tap_words(tap: Tap) -> str:
-    """Returns what a device can answer a tap with, as a clause."""
+def tap_words(tap: Tap | None) -> str:
+    """Returns what a device can answer a tap with, as a clause; None strikes nothing."""
+    if tap is None:
+        return "none is given: no geom that collides is rigid with the grip"
     spare = f"{tap.spare:.2g} N s/m more damping than the coupling needs" if tap.spare else ""
     weak = "" if tap.pulse >= FORCE_FLOOR else ", too weak to be felt"
     return (

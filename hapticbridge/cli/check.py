@@ -181,10 +181,8 @@ def _blow_lines(inventory: Inventory, contact: str, tap: Tap | None) -> dict[str
             f"{'; '.join(each)} ({_BOUNCES[contact]}):\n{'':23}1 m/s comes back as {e:.2g} m/s, a "
             f"fall of 100 mm rebounds to {100.0 * e * e:.2g} mm"
         )
-    if tap is not None:
-        lines["impact pulses"] = f"{tap_words(tap)}\n{'':23}(--impact-pulses 1)"
-    elif contact == RIGID and inventory.geoms[TOOL]:
-        lines["impact pulses"] = "none: no geom that collides is rigid with the grip"
+    if contact == RIGID and inventory.geoms[TOOL]:
+        lines["impact pulses"] = f"{tap_words(tap)} (--impact-pulses 1)"
     return lines
 
 
