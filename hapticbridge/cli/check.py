@@ -35,7 +35,6 @@ from hapticbridge.check.lean import (
     find_lean,
 )
 from hapticbridge.check.lean_output import check_lean_target, lean_facts, write_lean
-from hapticbridge.check.perception import tap_words
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress, working
@@ -43,7 +42,7 @@ from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.demand.methods import RIGID, Contact, RunCoupling, default_method
-from hapticbridge.demand.pulse import Tap
+from hapticbridge.demand.pulse import Tap, tap_words
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.mujoco_c import quiet
