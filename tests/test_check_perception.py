@@ -12,9 +12,10 @@ from outside_scenes import scene_file
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.check.lean import find_lean
-from hapticbridge.check.perception import FORCE_FLOOR, LEVER, WEBER, felt_error
+from hapticbridge.check.perception import LEVER, WEBER, felt_error
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.pulse import FORCE_FLOOR
 from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, SceneError

@@ -12,8 +12,14 @@ import pytest
 from kernel_runs import T, load
 from tapping import COUPLING, SPARE, parameters_of, tapping, towards, wall
 
-from hapticbridge.check.perception import FORCE_FLOOR, tap_words
-from hapticbridge.demand.pulse import PULSES, TAP_SPEED, Tap, pulse_of
+from hapticbridge.demand.pulse import (
+    FORCE_FLOOR,
+    PULSES,
+    TAP_SPEED,
+    Tap,
+    pulse_of,
+    tap_words,
+)
 from hapticbridge.device.simulated.device import SimulatedDevice
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.parameters import RunParameters

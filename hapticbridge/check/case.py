@@ -26,11 +26,9 @@ from hapticbridge.device.trajectory import DEFAULT_SECONDS, lissajous
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.kernel.record import SAMPLE_DTYPE
-from hapticbridge.kernel.shown_tool import tool_geoms
 from hapticbridge.recording import read_recording
 from hapticbridge.run.options import BridgeOptions, RunSetup, Workspace
 from hapticbridge.scene import Scene, SceneSource, compile_scene
-from hapticbridge.scene.contacts import meeting_pairs
 from hapticbridge.scene.fault import CompiledScene
 from hapticbridge.scene.source_map import Places
 
@@ -154,16 +152,10 @@ class SceneUnderCheck(CompiledScene):
 
     @property
     def tap(self) -> Tap | None:
-        """Tap of the tool in a run with pulses of blows; None if it can have none.
-
-        Contacts must be rigid, and a geom that collides be rigid with the grip.
-        """
-        model = self.scene.model
-        is_tool = tool_geoms(model, model.site(self.scene.grip).id)
-        meets = {geom for pair in meeting_pairs(model) for geom in pair[:2]}
-        if not (self.is_rigid and any(is_tool[geom] for geom in meets)):
+        """Tap of the tool in a run with pulses of blows; None if it can have none."""
+        if not self.is_rigid:
             return None
-        mujoco.mj_forward(model, self.scene.data)
+        mujoco.mj_forward(self.scene.model, self.scene.data)
         options = BridgeOptions(
             rate=1.0 / self.period,
             workspace=Workspace(scale=self.scale, force_scale=self.scale),

@@ -7,18 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.demand.pulse import Tap
+from hapticbridge.demand.pulse import FORCE_FLOOR
 from hapticbridge.errors import SceneError
-from hapticbridge.units import format_energy, format_si
 
 WEBER = 0.07
 """Just noticeable difference of a force as a share of it, without unit: 7 % from 2.5 to 10 N in the
 fingers (Pang, Tan & Durlach 1991). For torque 12.7 % was measured (Jandura & Srinivasan 1994), so 7
 % is the stricter choice. A larger value allows more simplification."""
-
-FORCE_FLOOR = 0.03
-"""Smallest noticeable force in N: 29 to 44 mN at the fingers (King, Donlin & Hannaford 2010), 21 mN
-with a pen (Lee & Hannaford 2003). It keeps a share of a very small force from counting."""
 
 LEVER = 0.05
 """Lever arm in m that converts a torque threshold into a force threshold: half a hand's breadth.
@@ -135,16 +130,3 @@ def _rms(vectors: NDArray[np.float64]) -> float:
 def _vector_part(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the vector part of a b⁻¹, whose length is the sine of half the angle."""
     return b[:, :1] * a[:, 1:] - a[:, :1] * b[:, 1:] - np.cross(a[:, 1:], b[:, 1:])
-
-
-# Felt taps
-
-
-def tap_words(tap: Tap) -> str:
-    """Returns what a device can answer a tap with, as a clause."""
-    spare = f"{tap.spare:.2g} N s/m more damping than the coupling needs" if tap.spare else ""
-    weak = "" if tap.pulse >= FORCE_FLOOR else ", too weak to be felt"
-    return (
-        f"a tap at {tap.speed:g} m/s burns about {format_energy(tap.burned)}, for a pulse of up to "
-        f"{format_si(tap.pulse, 'N')}{weak}; the device has {spare or 'no damping to spare'}"
-    )

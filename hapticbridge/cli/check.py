@@ -35,7 +35,6 @@ from hapticbridge.check.lean import (
     find_lean,
 )
 from hapticbridge.check.lean_output import check_lean_target, lean_facts, write_lean
-from hapticbridge.check.perception import tap_words
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress, working
@@ -43,7 +42,7 @@ from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.demand.methods import RIGID, Contact, RunCoupling, default_method
-from hapticbridge.demand.pulse import Tap
+from hapticbridge.demand.pulse import Tap, tap_words
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.mujoco_c import quiet
@@ -181,10 +180,8 @@ def _blow_lines(inventory: Inventory, contact: str, tap: Tap | None) -> dict[str
             f"{'; '.join(each)} ({_BOUNCES[contact]}):\n{'':23}1 m/s comes back as {e:.2g} m/s, a "
             f"fall of 100 mm rebounds to {100.0 * e * e:.2g} mm"
         )
-    if tap is not None:
-        lines["impact pulses"] = f"{tap_words(tap)}\n{'':23}(--impact-pulses 1)"
-    elif contact == RIGID and inventory.geoms[TOOL]:
-        lines["impact pulses"] = "none: no geom that collides is rigid with the grip"
+    if contact == RIGID and inventory.geoms[TOOL]:
+        lines["impact pulses"] = f"{tap_words(tap)} (--impact-pulses 1)"
     return lines
 
 

@@ -17,7 +17,6 @@ import numpy as np
 from rich.markup import escape
 
 from hapticbridge.arguments import option, shared
-from hapticbridge.check.perception import tap_words
 from hapticbridge.cli.terminal import (
     compiling,
     err,
@@ -37,6 +36,7 @@ from hapticbridge.demand.certificate import (
 from hapticbridge.demand.guard import refuse_simulated_time
 from hapticbridge.demand.loop_setting import device_period
 from hapticbridge.demand.methods import RunCoupling, default_method, unsuited_reason
+from hapticbridge.demand.pulse import tap_words
 from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.base import checked_close

@@ -10,6 +10,7 @@ from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.kernel.impact_pulse import largest_pulse
 from hapticbridge.kernel.jit import source_of
 from hapticbridge.kernel.parameters import LONGEST_DECAY, SHORTEST_DECAY, RunParameters
+from hapticbridge.units import format_energy, format_si
 
 PULSES = {"steel": (300.0, 0.011), "wood": (100.0, 0.0125), "rubber": (30.0, 0.0167)}
 """Frequency in Hz and time constant in s of the pulse of a blow on a material. A tap on a real
@@ -44,6 +45,10 @@ def pulse_of(text: str, subject: str = "pulse") -> tuple[float, float]:
         )
     return frequency, 1e-3 * decay
 
+
+FORCE_FLOOR = 0.03
+"""Smallest noticeable force in N: 29 to 44 mN at the fingers (King, Donlin & Hannaford 2010), 21 mN
+with a pen (Lee & Hannaford 2003). It keeps a share of a very small force from counting."""
 
 TAP_SPEED = 0.2
 """Speed in m/s of a tap, as a hand taps on a table. Its pulse grows in proportion to it."""
@@ -81,3 +86,15 @@ class Tap:
         power = energy / ((run.pulse_ticks + 1) * run.period)
         pulse = source_of(largest_pulse)(power, run.pulse_damping, run.pulse_speed)
         return cls(TAP_SPEED, restitution, burned, run.pulse_damping, min(pulse, run.force_limit))
+
+
+def tap_words(tap: Tap | None) -> str:
+    """Returns what a device can answer a tap with, as a clause; None strikes nothing."""
+    if tap is None:
+        return "none is given: no geom that collides is rigid with the grip"
+    spare = f"{tap.spare:.2g} N s/m more damping than the coupling needs" if tap.spare else ""
+    weak = "" if tap.pulse >= FORCE_FLOOR else ", too weak to be felt"
+    return (
+        f"a tap at {tap.speed:g} m/s burns about {format_energy(tap.burned)}, for a pulse of up to "
+        f"{format_si(tap.pulse, 'N')}{weak}; the device has {spare or 'no damping to spare'}"
+    )

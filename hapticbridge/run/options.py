@@ -68,9 +68,11 @@ from hapticbridge.kernel.parameters import (
 )
 from hapticbridge.kernel.pose import IDENTITY_POSE
 from hapticbridge.kernel.record import SAMPLE_DTYPE
+from hapticbridge.kernel.shown_tool import tool_geoms
 from hapticbridge.realtime import busy_step_time, scene_ticks_for, wants_real_time
 from hapticbridge.run.commands import CouplingLimits
 from hapticbridge.scene import Scene, custom_text
+from hapticbridge.scene.contacts import meeting_pairs
 from hapticbridge.scene.physics import site_inertia
 from hapticbridge.scene.rehearsal import (
     HOLDING_STEPS,
@@ -642,14 +644,19 @@ class RunSetup(StepTimes):
         own, _ = self.info.dissipating_damping
         return max((own or 0.0) - self.loop.needs()[0], 0.0) if self.impact_pulses else 0.0
 
-    def tap(self) -> Tap:
+    def tap(self) -> Tap | None:
         """Returns a tap of the tool, on the contact of the scene that bounces most.
 
-        The tool counts with its smallest inertia at the grip.
+        The tool counts with its smallest inertia at the grip. It is None if no geom that collides
+        is rigid with the grip.
         """
-        scene, e = self.scene, largest_restitution(self.scene.model)
-        mass = site_inertia(scene.model, scene.data, scene.model.site(scene.grip).id)
-        return Tap.of(self.unloaded(_AT_REST, None), mass, e)
+        model, data = self.scene.model, self.scene.data
+        grip = model.site(self.scene.grip).id
+        is_tool = tool_geoms(model, grip)
+        if not any(is_tool[geom] for pair in meeting_pairs(model) for geom in pair[:2]):
+            return None
+        mass = site_inertia(model, data, grip)
+        return Tap.of(self.unloaded(_AT_REST, None), mass, largest_restitution(model))
 
     def holding(self, start: NDArray[np.void], effective: Coupling | None) -> RunParameters:
         """Returns the parameters of a run that starts now and whose device can hold the tool.

@@ -12,8 +12,9 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.check.perception import FORCE_FLOOR, LEVER, tool_angles
+from hapticbridge.check.perception import LEVER, tool_angles
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.pulse import FORCE_FLOOR
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import work_of

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.check.perception import FORCE_FLOOR, WEBER
+from hapticbridge.check.perception import WEBER
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.pulse import FORCE_FLOOR
 from hapticbridge.device import Motion
 from hapticbridge.device.motion_file import read_motion
 from hapticbridge.errors import StudyError
