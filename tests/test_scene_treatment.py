@@ -132,6 +132,7 @@ DERIVED = {
     "flex_edgedamping": "edges",
     **{f"{kind}_gap": "gap" for kind in ("geom", "pair", "flex")},
     "actuator_history": "delays",
+    "sensor_history": "delays",
     "sensor_historyadr": "delays",
     "opt.timestep": "time step",
     "opt.integrator": "integrator",

@@ -225,13 +225,13 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
             spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
         raise SceneError(f"cannot read scene '{path}': {clause(error)}") from None
+    check_options(spec)
+    check_numbers(sources)
+    values = apply_parameters(spec, path, parameters)
     whole = warnings_of_reading(spec)
     firsts = {text.partition("\n")[0] for text in whole}
     for text in dict.fromkeys([*whole, *(line for line in told if line not in firsts)]):
         warnings.warn(f"MuJoCo: {'; '.join(text.splitlines())}", stacklevel=3)
-    check_options(spec)
-    check_numbers(sources)
-    values = apply_parameters(spec, path, parameters)
     return SceneSource(path, spec, sources, values)
 
 
