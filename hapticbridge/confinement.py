@@ -247,8 +247,9 @@ class Confined:
                 file_actions=[(os.POSIX_SPAWN_DUP2, writing, 1), void],
             )
         else:
-            sys.stdout.flush()
-            sys.stderr.flush()
+            for stream in (sys.stdout, sys.stderr):
+                if stream is not None:  # as where they are closed
+                    stream.flush()
             self._child = os.fork()
             if self._child == 0:
                 limited = _Limits(writing, seconds, limits)

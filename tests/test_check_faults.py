@@ -730,6 +730,8 @@ def test_a_motor_that_pushes_with_its_own_velocity_is_a_pump(
 GAINING = """<mujoco><option timestep="0.001"/><worldbody><body>
 <joint name="x" type="slide" damping="3"/><geom size="0.02" mass="0.5"/><site name="grip"/></body>
 </worldbody><actuator>{}</actuator></mujoco>"""
+THREE = 'pid input="pos vel ff" kp="3" kv="0.1" joint="x"'
+"""An actuator of three controls, so that those of the next one are not at its own number."""
 
 
 @pytest.mark.parametrize(
@@ -741,6 +743,8 @@ GAINING = """<mujoco><option timestep="0.001"/><worldbody><body>
         ('general gaintype="affine" gainprm="0 0 2" ctrlrange="-9 1.6"', "above 1.5"),
         ('damper kv="2" ctrlrange="0 9"', ""),
         ('general gaintype="affine" gainprm="3 4 0"', ""),
+        (f'{THREE}/><general gaintype="affine" gainprm="0 0 2" ctrlrange="-9 1.4"', ""),
+        (f'{THREE}/><general gaintype="affine" gainprm="0 0 2" ctrlrange="-9 1.6"', "above 1.5"),
     ],
 )
 def test_a_motor_whose_gain_grows_with_its_velocity_is_a_pump_under_some_control(

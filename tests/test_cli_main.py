@@ -235,6 +235,22 @@ def test_results_that_nobody_has_room_for_are_one_sentence() -> None:
     assert one_sentence(done.stderr) == "error: cannot write: No space left on device"
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no shell that closes a stream")
+def test_a_closed_stream_changes_no_result(tmp_path: Path) -> None:
+    """As of a service, or of a program without a terminal."""
+    run = ("run", "point_mass", "--fast", "--duration", "0.02", "--overwrite", "--record")
+    for words in ((*run, str(tmp_path / "a.mcap")), ("audit", str(tmp_path / "a.mcap"))):
+        for closed in ("1", "2", "0", "0,1,2"):
+            closing = " ".join(f"{number}>&-" for number in closed.split(","))
+            command = ["sh", "-c", f'exec "$@" {closing}', "sh", sys.executable, "-m"]
+            done = subprocess.run(
+                [*command, "hapticbridge", *words], capture_output=True, text=True, check=False
+            )
+            assert done.returncode == 0, (words, closed, done.stderr)
+            assert bool(done.stdout) == ("1" not in closed)
+            assert "Traceback" not in done.stderr
+
+
 PRINTED = {
     "PYTHONIOENCODING=ascii": "2 \\xb5m wide",
     "PYTHONIOENCODING=latin-1": "2 µm wide",

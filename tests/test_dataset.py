@@ -78,6 +78,27 @@ def test_a_frame_is_what_the_run_was_at_its_time(runs: list[Path], tmp_path: Pat
     assert "observation.ctrl" not in table, "the coupling's own actuators are none of the scene's"
 
 
+SEVERAL_CONTROLS = """<mujoco><option timestep="0.001" gravity="0 0 0"/><worldbody>
+<body name="tool"><freejoint/><geom size=".02" mass=".1"/></body>
+<body pos="1 0 0"><joint name="j" type="slide"/><geom size=".02" mass="1"/></body></worldbody>
+<actuator><pid name="servo" joint="j" input="pos vel ff" kp="3" kv="2"/>
+<motor name="motor" joint="j"/><motor joint="j"/></actuator>
+<keyframe><key name="home" ctrl=".1 .2 .3 .5 .6"/></keyframe></mujoco>"""
+
+
+def test_each_control_of_an_actuator_is_in_a_frame(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text(SEVERAL_CONTROLS)
+    scene = hb.load_scene(tmp_path / "scene.xml", grip="tool")
+    with hb.Bridge(scene, clock=hb.SimulatedClock(), recording=tmp_path / "run.mcap") as bridge:
+        bridge.run(duration=0.2)
+    write_dataset([tmp_path / "run.mcap"], "lerobot", tmp_path / "set", Shot(fps=20))
+    found = lerobot(tmp_path / "set", 0)["observation.ctrl"][0]
+    assert found == pytest.approx([0.1, 0.2, 0.3, 0.5, 0.6])
+    info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())
+    names = info["features"]["observation.ctrl"]["names"]
+    assert names == ["servo_0", "servo_1", "servo_2", "motor", "2"]
+
+
 def test_pictures_show_the_scene_without_arrows(runs: list[Path], tmp_path: Path) -> None:
     shot = Shot(fps=10, camera="free", width=64, height=48)
     folder = write_dataset(runs[:1], "lerobot", tmp_path / "set", shot).folder

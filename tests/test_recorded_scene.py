@@ -653,3 +653,13 @@ def test_a_trusted_scene_is_simulated_here(
     assert len(what_if(honest.path, {}, in_process=True).runs) > 1
     replay = pytest.importorskip("hapticbridge.view.replay").Replay
     assert len(replay(honest.path, in_process=True).sights) > 1
+
+
+def test_a_program_without_standard_streams_may_audit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of one with a window alone, where Python has None in their place."""
+    recorded(tmp_path / "run.mcap", "point_mass", duration=0.05)
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, name, None)
+    assert audit(tmp_path / "run.mcap").resimulation == "bit for bit"

@@ -358,6 +358,26 @@ def test_sources_of_a_specification_are_its_written_form_and_its_assets() -> Non
     assert again.body("tool").mass[0] == pytest.approx(0.1234567890123, rel=1e-5)
 
 
+@pytest.mark.parametrize("is_explicit", [True, False])
+@pytest.mark.parametrize("inertia", ["inertia", "fullinertia"])
+def test_an_inertia_that_a_program_set_is_kept(inertia: str, *, is_explicit: bool) -> None:
+    """Also beside geoms where it is explicit, as MuJoCo takes it."""
+    spec = built_spec()
+    values = (4e-3, 5e-3, 6e-3) if inertia == "inertia" else (4e-3, 5e-3, 6e-3, 1e-4, 0.0, 0.0)
+    for name, geoms in (("bare", 0), ("with a geom", 1)):
+        load = spec.body("tool").add_body(name=name, pos=[0.0, 0.0, 0.1])
+        load.mass, load.explicitinertial = 1.5, is_explicit
+        setattr(load, inertia, values)
+        for _ in range(geoms):
+            load.add_geom(size=[0.02, 0.0, 0.0], mass=0.1)
+    own, model = spec.copy().compile(), load_scene(spec).model
+    count = own.nbody
+    assert own.body_mass.sum() == pytest.approx(0.12346 + 1.5 + (1.5 if is_explicit else 0.1), 1e-4)
+    for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
+        expected = pytest.approx(getattr(own, field), rel=1e-4, abs=1e-7)
+        assert getattr(model, field)[:count] == expected, field
+
+
 def test_a_specification_with_a_number_that_no_file_holds_is_refused() -> None:
     for place, value in (("key_qpos[0, 2]", np.nan), ("body_pos[1, 2]", np.inf)):
         spec = built_spec()
@@ -389,6 +409,32 @@ def test_a_run_of_a_specification_is_simulated_again_bit_for_bit(tmp_path: Path)
     recorded(path, load_scene(built_spec()), duration=0.1)
     report = audit(path)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+# Warnings of MuJoCo as it reads
+
+LIGHT = """<mujoco><option gravity="0 0 -1.62"/><worldbody><body name="b"><geom size=".1"/></body>
+</worldbody></mujoco>"""
+ATTACHING = """<mujoco><asset><model name="part" file="part.xml"/></asset><worldbody>
+<body name="tool"><freejoint/><geom size=".02"/><attach model="part" body="b" prefix="p_"/></body>
+</worldbody></mujoco>"""
+
+
+def test_an_option_that_a_part_loses_is_told_with_both_values(tmp_path: Path) -> None:
+    (tmp_path / "part.xml").write_text(LIGHT)
+    (tmp_path / "scene.xml").write_text(ATTACHING)
+    lost = "parent has 0 0 -9.81 .default., child has 0 0 -1.62, keeping parent value"
+    with pytest.warns(UserWarning, match=f"^MuJoCo: Attach conflict .*; gravity: {lost}$"):
+        scene = load_scene(tmp_path / "scene.xml", grip="tool")
+    assert scene.model.opt.gravity[2] == -9.81
+
+
+def test_a_part_that_loses_nothing_is_not_told(tmp_path: Path) -> None:
+    (tmp_path / "part.xml").write_text(LIGHT.replace("-1.62", "-9.81"))
+    (tmp_path / "scene.xml").write_text(ATTACHING)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_scene(tmp_path / "scene.xml", grip="tool")
 
 
 # Bounds on what a scene may name and take

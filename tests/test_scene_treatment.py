@@ -95,6 +95,28 @@ def test_a_delay_keeps_its_time_at_another_time_step(
     assert scene.data.qvel[-1] == pytest.approx(data.qvel[-1], abs=4e-3)
 
 
+EXACT_DELAY = """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody><body name="tool">
+<freejoint/><geom size=".02" mass=".1"/></body><body pos="1 0 0"><joint name="j" type="slide"/>
+<geom size=".01" mass=".1"/></body></worldbody><actuator><motor name="0" joint="j" delay="0.02"
+nsample="10"/></actuator><sensor><clock/><clock delay="0.02" nsample="10"/><actuatorfrc
+actuator="0"/></sensor></mujoco>"""
+
+
+@pytest.mark.parametrize("period", [0.001, 0.0005, 0.002, 0.004, 0.01, 0.02])
+def test_as_many_samples_as_a_delay_needs_stay_as_many(tmp_path: Path, period: float) -> None:
+    """Ten samples of 2 ms hold a delay of 20 ms exactly, and so do those of each other step."""
+    path = tmp_path / "delayed.xml"
+    path.write_text(EXACT_DELAY)
+    scene = hb.load_scene(path, grip="tool")
+    prepare(scene, Coupling(100.0, 1.0, 1.0, 1e-3), period, 1, method_named("lossless"))
+    data, motor = scene.data, int(scene.model.actuator_ctrladr[scene.model.actuator("0").id])
+    for _ in range(50):
+        data.ctrl[motor] = data.time
+        mujoco.mj_step(scene.model, data)
+    now, sensor, force = data.sensordata
+    assert (now - sensor, now - force) == pytest.approx((0.02, 0.02))
+
+
 # Motion
 
 TOOL = """<body pos="5 5 5"><joint type="slide" axis="1 0 0"/><site name="grip"/>

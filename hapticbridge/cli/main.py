@@ -15,6 +15,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from hapticbridge.errors import HapticBridgeError, SafetyTrip, nearest
@@ -116,8 +117,12 @@ def _prepare_output() -> None:
     Python escapes on stderr what an encoding lacks, such as the µ of a unit, and fails on stdout.
     A width of 0 is that of a terminal whose width is not known; rich would print nothing.
     Pictures need no window: matplotlib would refuse to be imported for one that it does not know.
+    A stream that is closed reads or writes nothing, and no other file takes its number.
     """
     os.environ["MPLBACKEND"] = "agg"
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 - it stays
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
     for name in ("COLUMNS", "LINES"):

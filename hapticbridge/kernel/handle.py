@@ -305,7 +305,7 @@ def handle_facts(mj: Part, model: mujoco.MjModel) -> tuple[dict[str, int], NDArr
         dof = int(model.dof_parentid[dof])
     handle, site = int(mj["handle_body_id"]), int(mj["handle_site_id"])
     is_alone = (
-        int(mj["coupling_output_adr"]) + 6 == model.nu
+        int(mj["coupling_output_adr"]) + 6 == model.nout
         and model.body_sameframe[handle] == mujoco.mjtSameFrame.mjSAMEFRAME_BODY
         and model.site_sameframe[site] == mujoco.mjtSameFrame.mjSAMEFRAME_BODY
     )

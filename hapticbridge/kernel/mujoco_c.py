@@ -216,14 +216,26 @@ def forget_warnings(data: mujoco.MjData) -> None:
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
-    """Suppresses MuJoCo's printed warnings and its file MUJOCO_LOG.TXT; counters still count."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _message: None)
+def quiet() -> Iterator[list[str]]:
+    """Collects MuJoCo's warnings, neither printed nor in MUJOCO_LOG.TXT; counters still count."""
+    before, told = mujoco.get_mju_user_warning(), list[str]()
+    mujoco.set_mju_user_warning(told.append)
     try:
-        yield
+        yield told
     finally:
         mujoco.set_mju_user_warning(before)
+
+
+def warnings_of_reading(spec: mujoco.MjSpec) -> list[str]:
+    """Returns what MuJoCo warned of in a specification that was read and not yet compiled.
+
+    These are whole; a handler of warnings gets the first line of each alone.
+    """
+    library = ctypes.CDLL(str(library_path()))
+    text = library.mjs_getWarning
+    text.argtypes, text.restype = (ctypes.c_void_p, ctypes.c_int), ctypes.c_char_p
+    address = ctypes.c_void_p(spec._address)
+    return [text(address, k).decode() for k in range(library.mjs_numWarnings(address))]
 
 
 _SCALARS: dict[str, Any] = {

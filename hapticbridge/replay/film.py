@@ -375,15 +375,15 @@ def _states(path: Path, shot: Shot, worker: Worker) -> dict[str, Any]:
     if shot.camera is not None:
         name = None if shot.camera == FREE_CAMERA else shot.camera
         camera = Camera(stage, (shot.width, shot.height), name, has_forces=False)
-    model, ours = stage.model, added_actuators(stage.model)
-    own = [k for k in range(model.nactuator) if k not in ours]
+    model = stage.model
+    controls = _control_names(model)
     ticks = list(film_ticks(stage, shot.fps))
     rows, seen, pictures, readings = [], [], [], []
     for number, tick in enumerate(ticks, start=1):
         stage.show(tick)
         data = stage.data
         rows.append(stage.row.tobytes())
-        seen.append((data.qpos.copy(), data.qvel.copy(), data.ctrl[own].copy()))
+        seen.append((data.qpos.copy(), data.qvel.copy(), data.ctrl[list(controls)].copy()))
         readings.append(data.sensordata.copy())
         if camera is not None:
             buffer = io.BytesIO()
@@ -405,9 +405,23 @@ def _states(path: Path, shot: Shot, worker: Worker) -> dict[str, Any]:
         "sensors": np.array(readings),
         "sensor_names": _sensor_names(model),
         "names": names,
-        "controls": [model.actuator(k).name or str(k) for k in own],
+        "controls": list(controls.values()),
         "pictures": pictures,
     }
+
+
+def _control_names(model: mujoco.MjModel) -> dict[int, str]:
+    """Returns the name of each control of the scene's own actuators, by its place in ``ctrl``.
+
+    An actuator with several controls has its name followed by ``_0``, ``_1`` and so on.
+    """
+    ours, names = added_actuators(model), dict[int, str]()
+    for actuator in range(model.nactuator):
+        name, count = model.actuator(actuator).name or actuator, model.actuator_ctrlnum[actuator]
+        for k in range(0 if actuator in ours else count):
+            place = int(model.actuator_ctrladr[actuator]) + k
+            names[place] = f"{name}_{k}" if count > 1 else f"{name}"
+    return names
 
 
 def _sensors(path: Path, worker: Worker) -> dict[str, Any]:

@@ -137,7 +137,7 @@ def pumps(model: mujoco.MjModel, data: mujoco.MjData) -> list[Pump]:
             name = _joint_name(model, joint)
             words = f"{name} has a damping of {damping:.3g}: it pushes what moves already"
             found.append(Pump("joint", joint, words, 'damping="0" or more'))
-    for actuator in range(model.nu):
+    for actuator in range(model.nactuator):
         if pushes := _pushes(model, data, actuator):
             cause, array = pushes
             words = (
@@ -158,8 +158,9 @@ def _pushes(model: mujoco.MjModel, data: mujoco.MjData, actuator: int) -> tuple[
     if model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_AFFINE:
         gain = float(model.actuator_gainprm[actuator, 2])
     if gain != 0.0:
-        is_limited = bool(model.actuator_ctrllimited[actuator])
-        controls = model.actuator_ctrlrange[actuator] if is_limited else (-math.inf, math.inf)
+        control = model.actuator_ctrladr[actuator]
+        is_limited = bool(model.actuator_ctrllimited[control])
+        controls = model.actuator_ctrlrange[control] if is_limited else (-math.inf, math.inf)
         most = max(gain * float(control) for control in controls)
     if bias + most <= 0.0:
         return None

@@ -133,15 +133,16 @@ def carry_over(old: mujoco.MjModel, new: mujoco.MjModel) -> None:
 def set_step(spec: mujoco.MjSpec, step: float) -> None:
     """Sets a time step in s, and the samples of each delay so that they span the same time.
 
-    n samples span n − 1 steps, or intervals of a sensor that has longer ones. Fewer would shorten
-    the delay, because MuJoCo returns the oldest sample then.
+    MuJoCo stores n samples after each step, or each interval of a sensor that has a longer one, and
+    returns the oldest where a delay is longer. They span n − 1 intervals and one step.
     """
     own = spec.option.timestep
     for element in (*spec.actuators, *spec.sensors):
         interval = float(element.interval[0]) if isinstance(element, mujoco.MjsSensor) else 0.0
-        spacing = max(interval, own) / max(interval, step)
         if element.nsample > 0:
-            element.nsample = 1 + math.ceil((element.nsample - 1) * spacing - 1e-9)
+            spanned = (element.nsample - 1) * max(interval, own) + own
+            more = (spanned - step) / max(interval, step)
+            element.nsample = 1 + max(math.ceil(more - 1e-9), 0)
     spec.option.timestep = step
 
 

@@ -18,6 +18,7 @@ import mujoco
 
 from hapticbridge.arguments import shown
 from hapticbridge.errors import SceneError, SceneWarning, choices, nearest
+from hapticbridge.kernel.mujoco_c import quiet, warnings_of_reading
 from hapticbridge.scene.checks import (
     MAY_BE_ACTIVE,
     check_finite,
@@ -204,6 +205,9 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
     Raises:
         SceneError: The scene cannot be read, has an incompatible option, or a parameter is unknown
             or out of range.
+
+    Warns:
+        UserWarning: What MuJoCo warns of as it reads the file, such as a part's lost option.
     """
     path = scene_path(path_or_name)
     try:
@@ -217,12 +221,17 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
     try:
         sources = collect_sources(path)  # first: it refuses what MuJoCo must not open
         check_text(sources)
-        spec = mujoco.MjSpec.from_file(str(path))
+        with quiet() as told:
+            spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
         raise SceneError(f"cannot read scene '{path}': {clause(error)}") from None
     check_options(spec)
     check_numbers(sources)
     values = apply_parameters(spec, path, parameters)
+    whole = warnings_of_reading(spec)
+    firsts = {text.partition("\n")[0] for text in whole}
+    for text in dict.fromkeys([*whole, *(line for line in told if line not in firsts)]):
+        warnings.warn(f"MuJoCo: {'; '.join(text.splitlines())}", stacklevel=3)
     return SceneSource(path, spec, sources, values)
 
 
@@ -248,6 +257,9 @@ def spec_source(spec: mujoco.MjSpec) -> SceneSource:
     path = Path(spec.modelfiledir) / f"{spec.modelname or 'scene'}.xml"
     spec = spec.copy()
     with suppress(ValueError, mujoco.FatalError):  # the compilation of the scene gives the reason
+        for body in spec.bodies[1:]:
+            if body.explicitinertial or (body.mass > 0.0 and not body.geoms):
+                spec.adopt_inertial(body)  # one that a program set is not written otherwise
         model = spec.compile()
         check_finite(model)
         _name_folders(spec, model)
