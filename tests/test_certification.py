@@ -54,6 +54,7 @@ def test_run_and_audit_reach_one_verdict_with_one_reason(
     assert reason in report.reason
     assert summary.verdict == report.verdict == "passive"
     assert report.exit_code == (standing.verdict is False)
+    assert (report.answer == "nothing to certify") == (standing is Standing.NO_HAND)
 
 
 def test_a_late_device_that_has_the_damping_is_certified_for_its_delay(tmp_path: Path) -> None:

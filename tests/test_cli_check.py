@@ -72,6 +72,20 @@ def test_check_says_what_a_device_can_answer_a_tap_with(call: Called) -> None:
     assert "impact pulses        none is given: no geom" in call("check", "ratchet")[1]
 
 
+def test_run_and_check_foresee_the_same_tap(call: Called, tmp_path: Path) -> None:
+    """A run compares the file's motion with the bridge's first, and holds the tool for it."""
+    scene = tmp_path / "peg.xml"
+    scene.write_text(
+        """<mujoco><option timestep="0.001"/><worldbody><geom type="plane" size="1 1 .1"/>
+        <body name="tool" pos="0 0 .1"><freejoint/><geom type="box" size=".01 .01 .01" mass=".2"/>
+        <site name="grip"/></body></worldbody></mujoco>"""
+    )
+    words = "a tap at 0.2 m/s burns about 4 mJ"
+    _, _, err = call("run", scene, "--fast", "--duration", 0.1, "--impact-pulses", 1)
+    assert words in " ".join(err.split())
+    assert words in " ".join(call("check", scene)[1].split())
+
+
 @pytest.mark.parametrize("is_fused", [False, True])
 def test_check_names_a_body_whose_inertia_mujoco_refuses(
     is_fused: bool, tmp_path: Path, call: Called

@@ -227,7 +227,7 @@ def test_a_motor_that_pulls_the_tool_is_told_as_the_load_and_as_the_reason_of_th
     assert "actuator 'puller' pushes joint 'x' with 200 N from the start on" in err
     assert "lower --stiffness" not in err
     assert "passive (strict), then the guard stopped the run" in out
-    assert "mJ at most, beyond what it put in: the scene's motors did " in out
+    assert "mJ at most, beyond what it put in: the scene's motors gave or took " in out
     assert f"next: hapticbridge audit {record}" in out
     _, out, _ = call("audit", record)
     assert "and only --energy-limit bounds what they give the hand" in out

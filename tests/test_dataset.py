@@ -177,6 +177,17 @@ def test_robomimic_has_its_groups(runs: list[Path], tmp_path: Path) -> None:
             assert demo["dones"][:-1].sum() == 0
 
 
+def test_an_episode_that_the_guard_ended_is_told(call: Called, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    code, _, _ = call("run", "point_mass", "--fast", "--stretch-limit", 1e-6, "--record", path)
+    assert code == 3
+    code, _, err = call("export", path, "--format", "robomimic", "--out", tmp_path / "set")
+    assert code == 0
+    told = " ".join(err.split())
+    assert f"{path.name}: the guard tripped at tick " in told
+    assert "look at its episode" in told
+
+
 @pytest.mark.parametrize(("size", "spread"), [(1e-11, 1e-11), (1e-5, 2.0)])
 def test_rounding_is_no_motion_to_learn(tmp_path: Path, size: float, spread: float) -> None:
     actions = np.linspace(-1.0, 1.0, 13 * 5, dtype=np.float32).reshape(5, 13)
@@ -235,6 +246,7 @@ def test_a_programs_run_has_its_tool_and_says_where_it_was_placed_anew(
     folder = tmp_path / "set"
     code, _, err = call("export", path, "--format", "lerobot", "--out", folder)
     assert code == 0
+    assert "was reset" in err and "look at its episode" not in err
     jumps = write_dataset([path], "lerobot", tmp_path / "again").resets[0]
     assert [pytest.approx(time, abs=2e-3) for time in jumps] == [0.3]
     assert f"was reset at {jumps[0]:.3f} s: its episode jumps there" in " ".join(err.split())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import re
@@ -157,6 +158,7 @@ def test_a_tool_that_moves_at_once_is_placed_where_it_was_put(
     assert [event["pose"][2] for event in events if event["event"] == "reset"] == tops
     # of a program's scene nothing is known, in a table either
     assert audit_all([path]).texts("environment").tolist() == ["toward the hand"]
+    assert json.loads(audit(path).to_json())["environment"] == "toward the hand"
 
 
 # What a program may say

@@ -83,6 +83,7 @@ def test_a_run_of_two_hands_is_passive_and_repeats_to_the_bit(scene: str, tmp_pa
     summary = recorded(tmp_path / "run.mcap", scene)
     assert [each.grip for each in summary.hands] == ["left", "right"]
     assert (summary.verdict, summary.is_certified, summary.ticks) == ("passive", True, 1000)
+    assert "hands together get no more than they put in or the scene had stored" in summary.headline
     report = hb.audit(tmp_path / "run.mcap", in_process=True)
     assert (report.verdict, report.certified, report.hands) == ("passive", True, ("left", "right"))
     assert report.resimulation == "bit for bit"

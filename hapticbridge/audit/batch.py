@@ -72,9 +72,9 @@ def audit_all(
     ``AuditReport.margin``. A cut file is judged on the part that remains.
 
     Columns beside ``file``: ``margin``, ``verdict`` (also ``unreadable``), ``environment``,
-    ``certified`` (yes, if timely, no or not judged), ``exit_code``, the other fields of
-    ``AuditReport``, the energies at the end in J, and ``report``, the whole report as JSON (empty
-    if unreadable).
+    ``certified`` (yes, if timely, no, not judged or nothing to certify), ``exit_code``, the other
+    fields of ``AuditReport``, the energies at the end in J, and ``report``, the whole report as
+    JSON (empty if unreadable).
 
     Args:
         paths: Recordings; different files.

@@ -162,6 +162,7 @@ class AuditReport:
         values = asdict(self) | {"path": str(self.path), "margin": self.margin}
         for name in ("reason", "resimulation", "certified", "max_net_energy"):
             values[name] = getattr(self, name)
+        values["environment"] = self.state or None
         certification = values.pop("certification") and self.certification
         values |= certification.to_dict() if certification else {}
         if not self.hands:

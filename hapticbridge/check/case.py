@@ -155,7 +155,6 @@ class SceneUnderCheck(CompiledScene):
         """Tap of the tool in a run with pulses of blows; None if it can have none."""
         if not self.is_rigid:
             return None
-        mujoco.mj_forward(self.scene.model, self.scene.data)
         options = BridgeOptions(
             rate=1.0 / self.period,
             workspace=Workspace(scale=self.scale, force_scale=self.scale),

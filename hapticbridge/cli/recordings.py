@@ -128,7 +128,8 @@ class Export:
     file for the viewer of that name, 'foxglove' a layout for Foxglove, which opens the recording
     itself. 'lerobot' and 'robomimic' write a folder with an episode for each recording, simulated
     again. --from and --to cut a piece out of a run, for tables; the times of its marks are printed.
-    Exit code 1 if the recording is damaged: of what can be read, tables are written all the same.
+    Of a damaged recording tables are written as far as it can be read, with exit code 1; a data set
+    refuses it and a cut one.
 
     Example:
         hapticbridge export run.mcap --format csv --from 12.5 --to 20 --out grasp.csv
@@ -163,7 +164,8 @@ class Export:
     size: tuple[int, int] | None = option(None, metavar="W H")
     """Width and height of the pictures in pixels, both even; by default 320 240."""
     task: str | None = None
-    """Text of a data set on its task; by default the scene's name."""
+    """Text of a data set on its task, which policies may be given; by default the scene's name,
+    which says nothing for a program's own."""
     as_json: bool = option(False, flag="json")
     """Print what was written as JSON."""
 
@@ -224,7 +226,10 @@ class Export:
             count = len(done.episodes)
             episodes = "1 episode" if count == 1 else f"{count} episodes"
             out.print(f"wrote {plain(str(done.folder))}: {episodes}, {frames}")
-        for file, resets in zip(self.files, done.resets, strict=True):
+        for file, resets, end in zip(self.files, done.resets, done.ends, strict=True):
+            if end:
+                told = plain(f"{file}: {end}; look at its episode")
+                err.print(f"[yellow]warning:[/yellow] {told}")
             if resets:
                 times = ", ".join(f"{time:.3f} s" for time in resets)
                 err.print(

@@ -123,6 +123,8 @@ class Certification:
     @property
     def answer(self) -> str:
         """Verdict in a table; ``if timely``: no measurement confirms the delay."""
+        if self.standing is Standing.NO_HAND:
+            return "nothing to certify"
         if self.verdict:
             return "if timely" if self._if else "yes"
         return "not judged" if self.verdict is None else "no"

@@ -156,10 +156,13 @@ class HandEnergy:
         """Net energy and its origin, as far as it is known."""
         beyond = ["what it put in"]
         if self.ratio * self.scene > INSTANT:
-            released = f"the {format_energy(self.scene)} that the scene released"
+            released = f"what the scene released ({format_energy(self.scene)} at the end)"
             beyond.append(f"{self.times} {released}" if self.times else released)
-        works = {"motors": self.motors, "inputs": self.inputs}
-        origins = [f"the scene's {name} {work_words(works[name])}" for name in self._pushing]
+        works = {"motors": abs(self.motors), "inputs": abs(self.inputs)}  # of another instant
+        origins = [
+            f"the scene's {name} gave or took up to {format_energy(works[name])}"
+            for name in self._pushing
+        ]
         if origins:
             origins[-1] += f", and {_BOUND}"
         if self.ratio * self.springs > INSTANT:

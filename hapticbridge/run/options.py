@@ -650,11 +650,13 @@ class RunSetup(StepTimes):
         The tool counts with its smallest inertia at the grip. It is None if no geom that collides
         is rigid with the grip.
         """
-        model, data = self.scene.model, self.scene.data
+        model, data = self.scene.model, mujoco.MjData(self.scene.model)
         grip = model.site(self.scene.grip).id
         is_tool = tool_geoms(model, grip)
         if not any(is_tool[geom] for pair in meeting_pairs(model) for geom in pair[:2]):
             return None
+        data.qpos[:] = self.scene.data.qpos
+        mujoco.mj_forward(model, data)  # a check of the scene may have left another inertia
         mass = site_inertia(model, data, grip)
         return Tap.of(self.unloaded(_AT_REST, None), mass, largest_restitution(model))
 

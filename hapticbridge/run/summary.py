@@ -360,9 +360,12 @@ class Summary:
             more += self.certification.provisos
             more += ", apart from what motors and inputs gave" if self.hand_energy.limit else ""
             times = f"{self.hand_energy.times} what " if self.hand_energy.times else ""
+            get, device = "no hand gets more than it puts in", "device"
+            if self.hands:
+                get, device = "hands together get no more than they put in", "devices"
             return (
-                "passive, and certified: on the device as stated no hand gets more than it puts in "
-                f"or {times}the scene had stored{more}"
+                f"passive, and certified: on the {device} as stated {get} or {times}the scene had "
+                f"stored{more}"
             )
         judged = "not certified" if self.is_certified is False else "not judged"
         return f"the scene was passive, the device is {judged}: a hand may get energy out of it"

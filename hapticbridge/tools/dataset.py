@@ -30,6 +30,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit.verdict import unusual_end
+from hapticbridge.demand.trip import Trip
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.files import Hdf5File, import_extra, reason_of
 from hapticbridge.kernel.record import force_on_hand
@@ -435,11 +437,13 @@ class WrittenDataset:
         folder: The data set.
         episodes: Number of frames of each episode.
         resets: Times in s within each episode at which the scene was reset, so that it jumps.
+        ends: What ended each episode's run, as a clause; empty for an ordinary end.
     """
 
     folder: Path
     episodes: tuple[int, ...]
     resets: tuple[tuple[float, ...], ...]
+    ends: tuple[str, ...]
 
 
 def write_dataset(
@@ -492,7 +496,8 @@ def write_dataset(
         raise RecordingError(f"cannot write '{folder}': {reason_of(error, folder)}") from None
     finally:
         shutil.rmtree(draft, ignore_errors=True)
-    return WrittenDataset(folder, tuple(counts), tuple(map(_resets, recordings)))
+    ends = (unusual_end(Trip.among(each.events), each.events) for each in recordings)
+    return WrittenDataset(folder, tuple(counts), tuple(map(_resets, recordings)), tuple(ends))
 
 
 def _placings(recording: RecordingFile) -> list[Mapping[str, Any]]:
