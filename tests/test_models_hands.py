@@ -332,6 +332,7 @@ def test_the_hand_is_the_options_then_the_scenes_then_the_default(
         ("1000 30 inf 0.05", "hand rotational stiffness is inf N m/rad"),
     ],
 )  # fmt: skip
+@pytest.mark.filterwarnings("ignore:MuJoCo. XML contains a 'NaN'")
 def test_numbers_that_are_no_hand_are_refused(numbers: str, says: str, tmp_path: Path) -> None:
     scene = scene_with_hand(tmp_path, numbers)
     with pytest.raises(SceneError, match=says) as refused:

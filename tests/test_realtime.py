@@ -73,7 +73,12 @@ class Library:
 @pytest.fixture
 def library(monkeypatch: pytest.MonkeyPatch) -> Library:
     fake = Library()
-    monkeypatch.setattr(ctypes, "CDLL", lambda *_name, **_options: fake)
+    real = ctypes.CDLL
+    monkeypatch.setattr(
+        ctypes,
+        "CDLL",
+        lambda name, *more, **options: real(name, *more, **options) if name else fake,
+    )
     return fake
 
 
