@@ -15,7 +15,7 @@ from hapticbridge.demand.certificate import (
 )
 from hapticbridge.demand.methods import Method
 from hapticbridge.demand.own_loop import OwnLoopAccount
-from hapticbridge.demand.timekeeping import NOT_KEPT, RunTimes, Timekeeping, silence_in
+from hapticbridge.demand.timekeeping import RunTimes, Timekeeping, silence_in
 from hapticbridge.device import DeviceInfo
 from hapticbridge.kernel.hand_energy import HandEnergy
 from hapticbridge.kernel.parameters import UNGUARDED, RunParameters
@@ -161,7 +161,7 @@ class Certification:
     def _cause(self) -> str:
         """Clause on what refutes the certificate."""
         if self.standing is Standing.TIME:
-            return NOT_KEPT
+            return self.kept.cause
         if self.kept.alarm is not None and self.standing is Standing.ALARM:
             return self.kept.alarm.words
         if self.standing is Standing.ENERGY:

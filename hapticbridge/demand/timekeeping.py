@@ -39,6 +39,7 @@ from hapticbridge.theory.transfer import MAX_DELAY, CouplingGrid
 from hapticbridge.units import format_si
 
 NOT_KEPT = "the run did not keep its time"
+SCENE_BEHIND = "behind the device's delay the scene created energy"
 """Words that name this fault."""
 
 SLOW_MOTION = 0.95
@@ -296,12 +297,18 @@ class Timekeeping:
     @property
     def remark(self) -> str:
         """``words`` where the run was not simply in time; else empty."""
-        is_exact = (
-            min(self.share, self.fresh) == 1.0
-            and not self._late
-            and not (self.scene_rate or self.shown_rate)
-        )
+        is_exact = self._is_timely and not (self.scene_rate or self.shown_rate)
         return "" if is_exact else self.words
+
+    @property
+    def _is_timely(self) -> bool:
+        return min(self.share, self.fresh) == 1.0 and not self._late
+
+    @property
+    def cause(self) -> str:
+        """Clause on what refutes the certificate of a device that bears the coupling in time."""
+        is_behind = any(each.delay for each in self.in_time)
+        return SCENE_BEHIND if is_behind and self._is_timely else NOT_KEPT
 
     @property
     def _late(self) -> str:
@@ -353,6 +360,12 @@ class Timekeeping:
         """Sentence on the time that was not kept, with the remedy; or empty."""
         if self.is_kept is not False:
             return ""
+        given = f"{format_si(self.delay_energy, 'J')}, more than {format_si(INSTANT, 'J')}"
+        if self.cause == SCENE_BEHIND:
+            return (
+                f"{SCENE_BEHIND}, and it may have given the hand {given}, which no slack pays "
+                "there; 'hapticbridge check' looks for what creates it"
+            )
         at_times = f"at {self.rate:.4g} Hz{f' ({self._late})' if self._late else ''} it would need"
         pairs = zip(self.conditions, self.in_time, strict=True)
         failed = [(late, usual) for late, usual in pairs if late.holds is False]
@@ -365,10 +378,7 @@ class Timekeeping:
         else:
             is_behind = any(each.delay for each in self.in_time)
             givers = "late samples and forces" + ", and the scene behind the delay," * is_behind
-            reason = (
-                f"{givers} may have given the hand "
-                f"{format_si(self.delay_energy, 'J')}, more than {format_si(INSTANT, 'J')}"
-            )
+            reason = f"{givers} may have given the hand {given}"
         if self.silence and self.share >= MANY_KEPT and not self.sample_rate:
             return f"{NOT_KEPT}: {self.silence.sentence}; check its link and its power ({reason})"
         return f"{NOT_KEPT}: {reason}{self.slowness or f'; try {self.remedy}'}"
