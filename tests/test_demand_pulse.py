@@ -35,31 +35,37 @@ def parameters(**changes: Any) -> RunParameters:
 
 
 @pytest.mark.parametrize("spare", [SPARE, 0.5, 0.0])
-@pytest.mark.parametrize("share", [1.0, 0.25])
-def test_a_tap_is_answered_as_strongly_as_it_says(spare: float, share: float) -> None:
+@pytest.mark.parametrize(("share", "decay"), [(1.0, 0.0125), (0.25, 0.0125), (1.0, 5e-4)])
+def test_a_tap_is_answered_as_strongly_as_it_says(spare: float, share: float, decay: float) -> None:
     how: dict[str, Any] = {"pulse_damping": spare, "impact_pulses": share, "force_limit": 50.0}
+    how["pulse_decay"] = decay
     taps = tapping(**how)
     for _ in range(400):
         taps.tick(towards(TAP_SPEED))
-    tap = Tap.of(parameters(**how), MASS, 0.0)
+    tap = Tap.of(parameters(**how), MASS)
     blows = taps.ticks["blow_energy"]
     first = int(np.flatnonzero(blows)[0])
     assert blows[first : first + 5].sum() == pytest.approx(tap.burned, rel=0.25)
-    assert np.abs(taps.ticks["pulse"]).max() == pytest.approx(tap.pulse, rel=0.25)
+    # a blow of two ticks has forgotten its first; a second one adds to what is left of the first
+    assert 0.6 < np.abs(taps.ticks["pulse"]).max() / tap.pulse < 1.3
 
 
-def test_a_late_device_and_a_bounce_make_the_answer_weaker_and_the_force_limit_ends_it() -> None:
-    tap = Tap.of(parameters(), MASS, 0.0)
+@pytest.mark.parametrize("decay", [0.0125, 1e-3, 1e-4])
+def test_a_late_device_makes_the_answer_weaker_and_the_force_limit_ends_it(decay: float) -> None:
+    """The account forgets for a tick before the pulse: of a very short one nothing is left."""
+    how: dict[str, Any] = {"pulse_decay": decay}
+    tap = Tap.of(parameters(**how), MASS)
     assert tap.burned == pytest.approx(0.5 * MASS * TAP_SPEED**2)
-    assert tap.pulse == pytest.approx(2.0 * math.sqrt(SPARE * tap.burned / T))
-    late = Tap.of(parameters(guarding={"stated_delay": 3 * T}), MASS, 0.0)
+    kept = tap.burned * math.exp(-T / decay)
+    assert tap.pulse == pytest.approx(2.0 * math.sqrt(SPARE * kept / T))
+    late = Tap.of(parameters(guarding={"stated_delay": 3 * T}, **how), MASS)
     assert late.pulse == pytest.approx(tap.pulse / 2.0)
-    assert Tap.of(parameters(), MASS, 0.6).burned == pytest.approx(0.64 * tap.burned)
-    assert Tap.of(parameters(force_limit=1.0), MASS, 0.0).pulse == 1.0
+    least = min(1.0, tap.pulse)
+    assert Tap.of(parameters(force_limit=1.0, **how), MASS).pulse == pytest.approx(least)
 
 
 def test_words_of_a_tap_say_what_is_spare_and_what_is_too_weak() -> None:
-    felt = Tap(0.2, 0.0, 1e-3, 0.3, FORCE_FLOOR)
+    felt = Tap(0.2, 1e-3, 0.3, FORCE_FLOOR)
     assert "0.3 N s/m more damping" in tap_words(felt)
     assert "too weak" not in tap_words(felt)
     unfelt = tap_words(replace(felt, spare=0.0, pulse=0.99 * FORCE_FLOOR))

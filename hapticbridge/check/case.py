@@ -159,7 +159,7 @@ class SceneUnderCheck(CompiledScene):
             rate=1.0 / self.period,
             workspace=Workspace(scale=self.scale, force_scale=self.scale),
             impact_pulses=1.0,
-        )
+        ).for_scene(self.scene.model)
         setup = RunSetup.resolve(
             self.scene, self.info, self.coupling, options, SimulatedClock(), is_recorded=False
         )

@@ -58,34 +58,34 @@ TAP_SPEED = 0.2
 class Tap:
     """Tap of the tool on what does not give, and the largest pulse that may answer it.
 
-    The blow burns W = ½ m v² (1 − e²), and its pulse p is at most the force limit, and
+    The blow burns at most W = ½ m v², less where it bounces, and its pulse p is at most the force
+    limit, and
 
-        (d + 1) T max_u (p − b_s u) u <= q σ W,    0 <= u <= v_max
+        (d + 1) T max_u (p − b_s u) u <= q σ W exp(−T/τ),    0 <= u <= v_max
 
-    with the symbols of ``kernel.impact_pulse``.
+    with the symbols of ``kernel.impact_pulse``: its account forgets for a tick before the pulse.
 
     Attributes:
         speed: v in m/s.
-        restitution: e of the contact, without unit.
         burned: W in J.
         spare: b_s in N s/m, the device's damping beyond what the coupling needs.
         pulse: p in N.
     """
 
     speed: float
-    restitution: float
     burned: float
     spare: float
     pulse: float
 
     @classmethod
-    def of(cls, run: RunParameters, mass: float, restitution: float) -> Tap:
+    def of(cls, run: RunParameters, mass: float) -> Tap:
         """Returns the tap in a run with pulses; ``mass`` m in kg is what the contact meets."""
-        burned = 0.5 * mass * TAP_SPEED**2 * (1.0 - restitution**2)
-        energy = run.force_scale / run.scale * run.impact_pulses * burned
+        burned = 0.5 * mass * TAP_SPEED**2
+        kept = run.impact_pulses * math.exp(-run.period / run.pulse_decay)
+        energy = run.force_scale / run.scale * kept * burned
         power = energy / ((run.pulse_ticks + 1) * run.period)
         pulse = source_of(largest_pulse)(power, run.pulse_damping, run.pulse_speed)
-        return cls(TAP_SPEED, restitution, burned, run.pulse_damping, min(pulse, run.force_limit))
+        return cls(TAP_SPEED, burned, run.pulse_damping, min(pulse, run.force_limit))
 
 
 def tap_words(tap: Tap | None) -> str:
@@ -95,6 +95,6 @@ def tap_words(tap: Tap | None) -> str:
     spare = f"{tap.spare:.2g} N s/m more damping than the coupling needs" if tap.spare else ""
     weak = "" if tap.pulse >= FORCE_FLOOR else ", too weak to be felt"
     return (
-        f"a tap at {tap.speed:g} m/s burns about {format_energy(tap.burned)}, for a pulse of up to "
+        f"a tap at {tap.speed:g} m/s burns up to {format_energy(tap.burned)}, for a pulse of up to "
         f"{format_si(tap.pulse, 'N')}{weak}; the device has {spare or 'no damping to spare'}"
     )

@@ -82,7 +82,6 @@ from hapticbridge.scene.rehearsal import (
     static_load,
     toppling_force,
 )
-from hapticbridge.scene.softness import largest_restitution
 from hapticbridge.units import format_si
 
 # Options of a user
@@ -645,7 +644,7 @@ class RunSetup(StepTimes):
         return max((own or 0.0) - self.loop.needs()[0], 0.0) if self.impact_pulses else 0.0
 
     def tap(self) -> Tap | None:
-        """Returns a tap of the tool, on the contact of the scene that bounces most.
+        """Returns a tap of the tool on what does not bounce.
 
         The tool counts with its smallest inertia at the grip. It is None if no geom that collides
         is rigid with the grip.
@@ -658,7 +657,7 @@ class RunSetup(StepTimes):
         data.qpos[:] = self.scene.data.qpos
         mujoco.mj_forward(model, data)  # a check of the scene may have left another inertia
         mass = site_inertia(model, data, grip)
-        return Tap.of(self.unloaded(_AT_REST, None), mass, largest_restitution(model))
+        return Tap.of(self.unloaded(_AT_REST, None), mass)
 
     def holding(self, start: NDArray[np.void], effective: Coupling | None) -> RunParameters:
         """Returns the parameters of a run that starts now and whose device can hold the tool.

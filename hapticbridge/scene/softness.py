@@ -123,12 +123,6 @@ def bounces(model: mujoco.MjModel) -> tuple[Bounce, ...]:
     return tuple(_bounces(tuple(_springs(model))))
 
 
-def largest_restitution(model: mujoco.MjModel) -> float:
-    """Returns the coefficient of restitution of the contact that bounces most; 0 without one."""
-    contacts = "softness", "override softness"
-    return max((each.e for each in bounces(model) if each.subject in contacts), default=0.0)
-
-
 def _bounces(springs: Sequence[_Springs]) -> Iterator[Bounce]:
     law = source_of(rigid_restitution)
     for each in springs:
