@@ -75,17 +75,21 @@ def test_check_says_what_a_device_can_answer_a_tap_with(call: Called) -> None:
     assert "impact pulses        none is given: no geom" in call("check", "ratchet")[1]
 
 
-def test_check_and_run_refuse_a_pulse_that_is_none(call: Called, tmp_path: Path) -> None:
+def test_a_pulse_that_is_none_is_told_and_refused_by_a_run_that_needs_it(
+    call: Called, tmp_path: Path
+) -> None:
     scene = tmp_path / "peg.xml"
     text = scene_path("virtual_wall").read_text(encoding="utf-8")
     named = '<custom><text name="pulse" data="brass"/></custom></mujoco>'
     scene.write_text(text.replace("</mujoco>", named), encoding="utf-8")
-    for command in (("check", scene), ("run", scene, "--fast", "--impact-pulses", 1)):
-        code, _, err = call(*command)
-        assert code == 2
-        assert "the scene's custom text 'pulse' is 'brass'; it must be one of" in " ".join(
-            err.split()
-        )
+    told = "the scene's custom text 'pulse' is 'brass'; it must be one of"
+    code, out, _ = call("check", scene)
+    assert code == 0
+    assert f"none can be given: {told}" in " ".join(out.split())
+    assert facts_of(call, "check", scene)[1]["tap"] is None
+    code, _, err = call("run", scene, "--fast", "--impact-pulses", 1)
+    assert code == 2
+    assert told in " ".join(err.split())
 
 
 def test_run_and_check_foresee_the_same_tap(call: Called, tmp_path: Path) -> None:

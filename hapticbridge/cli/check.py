@@ -44,7 +44,7 @@ from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.demand.methods import RIGID, Contact, RunCoupling, default_method
 from hapticbridge.demand.pulse import Tap, tap_words
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.errors import SceneError
+from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.plotting import check_ending, write_picture
 from hapticbridge.run.hands import Grasp
@@ -170,7 +170,7 @@ _BOUNCES = {"rigid": "as rigid impacts", "scene": "by MuJoCo's springs, as in th
 """Cause of a bounce, by the kind of contacts."""
 
 
-def _blow_lines(inventory: Inventory, contact: str, tap: Tap | None) -> dict[str, str]:
+def _blow_lines(inventory: Inventory, contact: str, tapped: str) -> dict[str, str]:
     """Returns what a blow does in the scene and on the device, by the head of its line."""
     lines = {}
     if inventory.bounces:
@@ -183,14 +183,23 @@ def _blow_lines(inventory: Inventory, contact: str, tap: Tap | None) -> dict[str
         )
         lines["bounces"] = f"{'; '.join(each)} ({_BOUNCES[contact]}):\n{'':23}{back}"
     if contact == RIGID and inventory.geoms[TOOL]:
-        lines["impact pulses"] = f"{tap_words(tap)} (--impact-pulses 1)"
+        lines["impact pulses"] = f"{tapped} (--impact-pulses 1)"
     return lines
 
 
-def print_inventory(inventory: Inventory, contact: str, tap: Tap | None) -> None:
+def _tap_of(case: SceneUnderCheck) -> tuple[Tap | None, str]:
+    """Returns the tap of the tool and its words; none where the scene names no valid pulse."""
+    try:
+        tap = case.tap
+    except HapticBridgeError as error:
+        return None, f"none can be given: {error}"
+    return tap, tap_words(tap)
+
+
+def print_inventory(inventory: Inventory, contact: str, tapped: str) -> None:
     """Prints what the scene models, with the stiffness of the contacts that a run takes.
 
-    ``tap`` is a tap of the tool in a run with pulses; None leaves it out.
+    ``tapped`` says what a run with pulses answers a tap of the tool with.
     """
     out.print("\n[bold]What it models[/]")
     uses = ", ".join(f"{count} {use}" for use, count in inventory.geoms.items() if count)
@@ -214,7 +223,7 @@ def print_inventory(inventory: Inventory, contact: str, tap: Tap | None) -> None
         lines["contact stiffness"] = (
             f"{least} to {most} kN/m at the tool, which {sank} ({_CONTACTS[contact]})"
         )
-    lines |= _blow_lines(inventory, contact, tap)
+    lines |= _blow_lines(inventory, contact, tapped)
     is_met = inventory.rows is None or inventory.geoms[MEETS_TOOL] > 0
     if inventory.possible_pairs and not inventory.flexes and not is_met:
         lines["contact"] = (
@@ -426,7 +435,7 @@ class Check:
         is_sound = all(fault.is_note for fault in faults)
         if not self.as_json:
             print_case(case)
-            print_inventory(inventory, case.contact, case.tap)
+            print_inventory(inventory, case.contact, _tap_of(case)[1])
             print_cost(cost)
             print_faults(faults, is_urdf=b"<robot" in source.sources[0].data)
             if is_sound:
@@ -500,7 +509,7 @@ def _facts(
         "period_s": case.period,
         "contact": case.contact,
         "inventory": asdict(inventory),
-        "tap": None if case.tap is None else asdict(case.tap),
+        "tap": (tap := _tap_of(case)[0]) and asdict(tap),
         "faults": [asdict(fault) | {"is_note": fault.is_note} for fault in faults],
         "cost": None if cost is None else asdict(cost),
     }
