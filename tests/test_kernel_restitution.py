@@ -1,4 +1,4 @@
-"""Restitution of rigid contacts and limits: Newton's rebound, paid for by the blow itself."""
+"""Restitution of rigid contacts and limits, in closed form and against Routh's path."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from hapticbridge.kernel.restitution import MAX_RESTITUTION, restitution, rigid_
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
 from hapticbridge.run.bridge import Bridge
-from hapticbridge.theory.impact import ImpactBody, resolve_impact
+from hapticbridge.theory.impact import ImpactBody, Mode, resolve_impact
 
 COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
 GRAVITY = 9.81
@@ -104,16 +104,16 @@ def apexes(heights: Array) -> Array:
     return np.asarray(inner[(inner > heights[:-2]) & (inner >= heights[2:])])
 
 
-@pytest.mark.parametrize("damping", [0.04, 0.1, 0.2])
+@pytest.mark.parametrize("damping", [0.04, 0.1, 0.2, 0.4])
 @pytest.mark.parametrize("period", [1e-3, 2.5e-4])
 def test_a_dropped_ball_rises_to_e_squared_of_its_height(damping: float, period: float) -> None:
     e = e_of(damping)
-    for drop in np.linspace(1.0, 1.05, 4):  # other phases of the step at which it strikes
+    for drop in np.linspace(0.2, 0.21, 4):  # other phases of the step at which it strikes
         xml = scene(BALL.format(height=drop + RADIUS), damping, GRAVITY)
         run = started(xml, period=period)
         fall = np.sqrt(2 * drop / GRAVITY)
         heights = resting(run, fall * (1 + 2 * e), lambda d: d.body("ball").xpos[2] - RADIUS)
-        assert apexes(heights)[0] == pytest.approx(e**2 * drop, rel=0.01)
+        assert apexes(heights)[0] == pytest.approx(e**2 * drop, rel=1e-3)
         assert heights.min() > -1e-6
         assert strict(run)
 
@@ -124,14 +124,25 @@ def test_a_ball_rebounds_again_and_again_and_comes_to_rest() -> None:
     run = started(scene(BALL.format(height=drop + RADIUS), damping, GRAVITY))
     heights = resting(run, 4.0, lambda d: d.body("ball").xpos[2] - RADIUS)
     series = np.concatenate([[drop], apexes(heights)])
-    series = series[series > 0.01]
-    assert series.size > 4
+    series = series[series > 0.005]
+    assert series.size > 5
     for before, after in pairwise(series):
-        speed = np.sqrt(2 * GRAVITY * before)
-        # a blow begins within T v of the surface, and a flight ends within T v of its apex
-        assert abs(after - e**2 * before) < T * speed * (1 - e**2 + (e - e**2) / 2)
+        assert after == pytest.approx(e**2 * before, rel=5e-3)
     assert np.abs(np.diff(heights[-500:])).max() < 1e-12
     assert abs(heights[-1]) < 1e-6
+    assert strict(run)
+
+
+@pytest.mark.parametrize("gravity", [50.0, 200.0])
+def test_a_pressed_ball_rises_as_high_as_from_the_surface(gravity: float) -> None:
+    e, drop = e_of(0.1), 0.1
+    run = started(scene(BALL.format(height=drop + RADIUS), 0.1, gravity))
+    time = np.sqrt(2 * drop / gravity) * (1 + 2 * e)
+    heights = resting(run, time, lambda d: d.body("ball").xpos[2] - RADIUS)
+    first = apexes(heights)[0]
+    assert first == pytest.approx(e**2 * drop, abs=gravity * T**2 / 8 + 1e-3 * drop)
+    speed = np.sqrt(2 * gravity * drop)
+    assert T * speed > 0.03 * e**2 * drop  # what a rebound from the gap of the blow may add
     assert strict(run)
 
 
@@ -235,18 +246,19 @@ def fallen_rod(
     return RodBlow(created, tip, run)
 
 
-def test_newtons_rule_alone_creates_the_known_energy_and_a_paid_blow_creates_none() -> None:
+def test_newtons_rule_alone_creates_the_known_energy_and_poissons_impulse_takes_some() -> None:
     e = 0.9
     damping = damping_of(e)
     body = ImpactBody(1.0, 1 / 12, np.array([-0.5, -0.5]) * np.sqrt(0.5))
-    known = resolve_impact(body, np.array([0.8, -1.0]), 0.75, e, "newton")
+    start = np.array([0.8, -1.0])
+    newton, poisson = (resolve_impact(body, start, 0.75, e, law) for law in ("newton", "poisson"))
     alone = fallen_rod(np.pi / 4, (0.8, -1.0), damping, 0.75, np.inf)
-    assert alone.created == pytest.approx(float(known.energy_change), rel=0.01)
+    assert alone.created == pytest.approx(float(newton.energy_change), rel=0.01)
     assert alone.created == pytest.approx(0.040625, rel=0.01)
     assert alone.tip == pytest.approx([0.0, e], abs=2e-3)
-    paid = fallen_rod(np.pi / 4, (0.8, -1.0), damping, 0.75, None)
-    assert -0.05 < paid.created < 0.0
-    assert 0.75 < paid.tip[1] < e
+    blow = fallen_rod(np.pi / 4, (0.8, -1.0), damping, 0.75, None)
+    assert blow.created == pytest.approx(-0.144055, rel=2e-3)
+    assert blow.tip == pytest.approx(poisson.velocity, abs=1e-3)
 
 
 def damping_of(e: float) -> float:
@@ -258,9 +270,9 @@ def damping_of(e: float) -> float:
     return low
 
 
-def test_random_rods_create_energy_by_newtons_rule_alone_and_none_if_they_pay() -> None:
+def test_random_rods_have_the_smaller_of_newtons_and_poissons_rebound() -> None:
     generator = np.random.default_rng(5)
-    alone, paid, errors = [], [], []
+    alone, created, errors = [], [], []
     for _ in range(60):
         angle, friction = generator.uniform(0.1, np.pi - 0.1), generator.uniform(0.3, 1.0)
         e = generator.uniform(0.7, 0.95)
@@ -268,14 +280,20 @@ def test_random_rods_create_energy_by_newtons_rule_alone_and_none_if_they_pay() 
         case = angle, velocity, damping_of(e), friction
         alone.append(fallen_rod(*case, np.inf).created)
         blow = fallen_rod(*case, None)
-        paid.append(blow.created)
-        ratio = float(blow.run.binding.state["contact"]["rebound_ratio"][0])
-        errors.append(abs(blow.tip[1] + e * velocity[1]) / -velocity[1] if ratio == 1.0 else 0.0)
+        created.append(blow.created)
         assert strict(blow.run)
+        body = ImpactBody(1.0, 1 / 12, -0.5 * np.array([np.cos(angle), np.sin(angle)]))
+        newton, poisson = (
+            resolve_impact(body, np.array(velocity), friction, e, law)
+            for law in ("newton", "poisson")
+        )
+        smaller = min(newton, poisson, key=lambda law: float(law.impulse[1]))
+        if smaller.mode <= Mode.STICKS_IN_COMPRESSION:  # one step has no friction that turns round
+            errors.append(np.abs(blow.tip - smaller.velocity).max() / -velocity[1])
     assert max(alone) > 0.01
-    assert max(paid) < 0.0
-    assert np.median(errors) < 5e-3
-    assert np.quantile(errors, 0.9) < 0.02
+    assert max(created) < 0.0
+    assert len(errors) > 40
+    assert max(errors) < 0.02
 
 
 # Behind the coupling
@@ -359,6 +377,17 @@ def test_a_tool_is_struck_with_the_rebound_it_can_pay_for(
         assert (parting == pytest.approx(e * speed, rel=2e-3)) == is_kept
         assert 0.5 * e * speed < parting < 1.002 * e * speed
         assert strict(run)
+
+
+def test_the_record_has_the_restitution_at_the_surface() -> None:
+    e, speed = e_of(0.1), 0.3
+    for phase in np.linspace(0.0, 1.0, 4, endpoint=False):
+        run = started(scene(STRUCK.format(height=0.026 + phase * speed * T), 0.1, 50.0))
+        run.scene.data.qvel[6] = -speed
+        rows = go_on(run, at_rest(30)).ticks
+        first = rows[np.flatnonzero(rows["blow_speed"])[0]]
+        assert first["blow_restitution"] == pytest.approx(e)
+        assert first["blow_rebound"] == pytest.approx(e, rel=2e-3)
 
 
 PRESSED = """<body name="tool" pos="0 0 0.01"><freejoint/>

@@ -81,7 +81,7 @@ from hapticbridge.kernel.pose import (
     vector_of,
 )
 from hapticbridge.kernel.restitution import BLOW_SPEED
-from hapticbridge.kernel.rigid_contact import MAX_ROWS, note_ends
+from hapticbridge.kernel.rigid_contact import MAX_ROWS, note_ends, restitution_of
 from hapticbridge.kernel.tick_guard import within_limit
 
 FORGOTTEN = 1e-12
@@ -168,7 +168,7 @@ def note_blows(s: State) -> None:
         return
     note_ends(s)
     ends, force = floats(s.contact.end_velocity, count), floats(pointer_at(mj.efc_force), count)
-    velocities, rebounds = floats(pointer_at(mj.efc_vel), count), floats(s.contact.rebounds, count)
+    velocities = floats(pointer_at(mj.efc_vel), count)
     is_tool, contacts = ints(mj.geom_is_tool, mj.ngeom), pointer_at(mj.contact)
     for c in range(ints(mj.ncon, 1)[0]):
         one = contacts + c * mj.contact_size
@@ -186,8 +186,7 @@ def note_blows(s: State) -> None:
         store_vector(impact.normal, add(vector_of(impact.normal), scaled(side * energy, normal)))
         if energy > impact.largest_blow:
             impact.largest_blow, impact.blow_speed = energy, -speed
-            impact.blow_restitution = -rebounds[row] / speed if s.contact.bounces else 0.0
-            impact.blow_rebound = max(-end / speed, 0.0)
+            impact.blow_restitution, impact.blow_rebound = restitution_of(s, row, -speed, end)
 
 
 @compiled

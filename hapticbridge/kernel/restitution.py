@@ -1,31 +1,38 @@
 """Restitution of rigid contacts and limits, paid for by the blow itself.
 
 A row that closes in the step is a *blow* if its normal velocity v_n at the start, in m/s, is beyond
-``BLOW_SPEED``. It is aimed at Newton's rebound, where any other row is aimed at −gap/h:
+``BLOW_SPEED``. The step is then solved twice. In its *compression* the row is aimed at ŵ = 0, and
+its normal impulse P_c in N s is noted. In its *restitution* the row is aimed at
 
-    ŵ = −ρ e v_n,    e of the row's own ``solref``,    0 <= ρ <= 1
+    ŵ = ρ w,    0 <= ρ <= 1,    with a normal impulse of at most (1 + e) P_c
 
-Of a mocap body's move, δ/h is part of v_n and comes off ŵ again. The lift of sliding is subtracted
-as ever; the step is repeated until the rebound is met within ``REBOUND_ERROR``.
+The coefficient e is that of the row's own ``solref``. The rebound w is e times the speed at the
+surface, taken to the place where the step ends (``rebound_speed``); forces that press in the step
+count as in a flight, constraints do not. Of a mocap body's move, δ/h is part of v_n and comes off ŵ
+again. The lift of sliding is subtracted as ever; a step is repeated until its rebound is met within
+``REBOUND_ERROR``.
 
-Newton's rule may create energy where there is friction: 0.041 J with a rod of 1 kg that falls at
-1 m/s (e = 0.9). The energy of a step is, with C given by the rows and the remainder r,
+That is Newton's rule where no friction couples normal and sliding, and elsewhere the smaller of
+Newton's and Poisson's rebound. Newton's alone may create energy: 0.041 J with a rod of 1 kg that
+falls at 1 m/s (e = 0.9), where Poisson's takes 0.144 J. Along Routh's path Poisson's takes energy
+at any one point. Of several at once nothing of the kind is known, so each step is judged. Its
+energy is, with C given by the rows and the remainder r,
 
     E_k = C − ½‖v⁺ − v‖²_M + r
 
 A step with a blow is kept if C <= (share of the tank) + ``PAID`` ½‖v⁺ − v‖²_M. Then E_k is at most
 what the tank holds, plus r − (1 − ``PAID``) ½‖v⁺ − v‖²_M. Otherwise it is repeated with a smaller
 ρ, at last 0, which is the law without a blow. This needs no property of geometry or friction.
-Without friction and other forces, C/(½‖v⁺ − v‖²_M) = 2e/(1 + e). A force that presses in the step,
-as weight does, adds to C: high rebounds below 0.1 m/s are lowered, those of a resting body end.
+Without friction and other forces, C/(½‖v⁺ − v‖²_M) = 2e/(1 + e). Of a resting body, blows end.
 
 One ρ holds for all blows of a step. A chain of bodies that touch passes a blow on as if they were
-one body. The rebound begins within h|v_n| of the surface, so that a ball's rebound height errs by
-that much: 1 mm at 1 m/s and 1 ms. A lossless tool that is struck before it is seen near, from about
-4 m/s on at 1 ms, pays nothing, because its ½‖v⁺ − v‖²_M is no loss: its rebound is smaller.
+one body. Where a point slides back in the blow, the step's friction acts as at its end alone. A
+lossless tool that is struck before it is seen near, from about 4 m/s on at 1 ms, pays nothing,
+because its ½‖v⁺ − v‖²_M is no loss: its rebound is smaller.
 
 References:
-    Stronge 1990, Proc. R. Soc. A 431 (Newton's rule and energy).
+    Routh 1905 (the path of an impact); Anitescu & Potra 1997 (compression and restitution in a
+    step); Stronge 1990, Proc. R. Soc. A 431 (Newton's rule and energy).
 """
 
 from __future__ import annotations
@@ -99,18 +106,33 @@ def rigid_restitution(first: float, second: float) -> float:
 
 
 @compiled
-def rebound_speed(speed: float, gap: float, solref: int) -> float:
-    """Returns e|v_n| in m/s of a contact or limit that closes in a blow, 0 of any other.
+def square_at_surface(speed: float, gap: float, pressing: float, h: float) -> float:
+    """Returns (|v| + ah/2)² + 2ag, the square of the speed at the surface in m²/s².
+
+    A body that is pressed with the acceleration a keeps it through the samples of a flight, and a
+    surface that it leaves or reaches between them is as good as one that it meets at a sample.
 
     Args:
-        speed: Normal velocity v_n in m/s at the start of the step, < 0 if it closes.
-        gap: Gap in m at the end of the step with that velocity.
-        solref: Address of its ``solref``.
+        speed: |v_n| in m/s, at the start of the step of a blow or at its end.
+        gap: Gap g in m at the start of the step.
+        pressing: a in m/s², >= 0.
+        h: Time step in s.
     """
-    if speed >= -BLOW_SPEED or gap > 0.0:
-        return 0.0
-    numbers = floats(solref, 2)
-    return -speed * rigid_restitution(numbers[0], numbers[1])
+    return (speed + 0.5 * h * pressing) ** 2 + 2.0 * pressing * gap
+
+
+@compiled
+def rebound_speed(e: float, speed: float, gap: float, pressing: float, h: float) -> float:
+    """Returns the speed w in m/s at the end of a step whose blow leaves the surface with e.
+
+    The step ends at the gap g + h w, so the rebound rises as high as one from the surface if
+
+        (w + ah/2)² + 2ag = e² [(|v_n| + ah/2)² + 2ag]
+
+    ``speed`` is |v_n| at its start; the others are as in ``square_at_surface``.
+    """
+    square = e**2 * square_at_surface(speed, gap, pressing, h) - 2.0 * pressing * gap
+    return max(math.sqrt(max(square, 0.0)) - 0.5 * h * pressing, 0.0)
 
 
 def has_bounce(model: mujoco.MjModel) -> bool:

@@ -27,7 +27,7 @@ remainder r of the integration (inertia that turns, explicit forces) is in E_k a
 moved mocap body pays for its own push: its work belongs to the external port and is subtracted from
 C. If it recedes by δ, ŵ is smaller by δ/h: a body that rests on it follows, and gives its energy to
 that port. All this holds for any ŵ <= 0 in a gap. A contact therefore only has to be known before
-it closes: margins follow the speed (``follow_speed``).
+it closes: margins follow the speed (``kernel.contact_margins``).
 
 A contact is *blocked* if no joint can answer along its normal, J M⁻¹ Jᵀ of its normal row being at
 most ``BLOCKED`` of that of its friction: a puck on two slides, a drawer on its runners. The law
@@ -42,8 +42,9 @@ along its normal, and friction takes energy; where the tank says otherwise the s
 with the law of other contacts. The exact inverse inertia of such a row is 0, so a step
 with one uses the approximate ones for all.
 
-A contact that closes in a *blow* is aimed at its rebound (``kernel.restitution``). Such a step may
-give what the blow itself dissipates, too; beyond it, the rebound is lowered.
+A contact that closes in a *blow* is first aimed at 0 and then at its rebound
+(``kernel.restitution``). Such a step may give what the blow itself dissipates, too; beyond it, the
+rebound is lowered.
 
 Limits of joints and tendons are rows like those of a contact without friction; they hold a joint
 at the scene's own margin from the end of its range, as MuJoCo's do. An equality
@@ -77,14 +78,16 @@ from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.ledger import mocap_work, opened_by_mocap
 from hapticbridge.kernel.mujoco_c import floats, ints, mj_mul_jac, pointer_at, struct_of
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.pose import Vector, add, cross, norm, subtract, vector_of
 from hapticbridge.kernel.restitution import (
+    BLOW_SPEED,
     NOTABLE_BOUNCE,
     PAID,
     PRESSING,
     has_bounce,
     kinetic_loss,
     rebound_speed,
+    rigid_restitution,
+    square_at_surface,
 )
 
 SOFTNESS = 1e-3
@@ -128,7 +131,8 @@ MAX_CORRECTIONS = 3
 """Largest number of such repetitions of a step."""
 
 MAX_ROWS = 1024
-"""Largest number of constraint rows with which sinks are looked for; 340 contacts with friction."""
+"""Largest number of constraint rows with which sinks are looked for and blows bounce; 340 contacts
+with friction."""
 
 SPENDABLE = 0.9
 """Largest share of the tank that one tick spends, without unit. The rest covers the remainder of
@@ -156,6 +160,12 @@ one keeps more of the rebound and repeats more steps."""
 REBOUND_ERROR = 0.01
 """Largest error of a rebound's normal velocity, without unit, before the step is repeated."""
 
+COMPRESSION, RESTITUTION = 1, 2
+"""Stages of a step with a blow."""
+
+NO_REBOUND = -1.0
+"""Instead of a rebound's velocity in m/s, where a row is no blow."""
+
 _EXACT = 1e-9
 """ε of the module's equations, without unit: the spring that is left in the row of a contact, and
 the velocity that is left in the rows of friction."""
@@ -182,8 +192,6 @@ _SLIGHT = 1e-6
 """Mobility along the normal over that of the body, and over ``BLOCKED``, below which a contact
 without friction is blocked; no unit."""
 
-_BALL = int(mujoco.mjtJoint.mjJNT_BALL)
-
 _MAX_KEPT = int(mujoco.mjNSOLVER)
 
 _NEWTON, _CG = int(mujoco.mjtSolver.mjSOL_NEWTON), int(mujoco.mjtSolver.mjSOL_CG)
@@ -200,12 +208,13 @@ _OF_MODEL = (
     *("body_parentid", "body_rootid", "body_dofadr", "body_dofnum"),
     *("body_invweight0", "dof_invweight0"),
 )
-_OF_DATA = ("geom_xpos", "subtree_com", "cdof", "ten_velocity")
+_OF_DATA = ("geom_xpos", "subtree_com", "cdof", "ten_velocity", "qacc_smooth")
+_OF_BLOWS = ("restitutions", "approaches", "gaps", "pressings", "impulses", "rebounds")
 _OWNED = (
     *(f"own_{name}" for name in _PARAMETERS),
     *("eq_type", "row_positions", "row_shifts", "end_velocity", "moving_geoms", "body_velocity"),
     *("leashes", "blocked", "geom_rest", "pair_rest"),
-    *("rebounds", "velocity_change", "momentum_change"),
+    *("velocity_change", "momentum_change", *_OF_BLOWS),
 )
 
 RIGID_DTYPE = np.dtype(
@@ -223,6 +232,8 @@ RIGID_DTYPE = np.dtype(
         ("solver", "<i8"),
         ("own_solver", "<i8"),
         ("bounces", "<i8"),
+        ("blow_stage", "<i8"),
+        ("cuts", "<i8"),
         ("statistics", "<i8"),
         ("warmstart", "<i8"),
         ("row_capacity", "<i8"),
@@ -255,13 +266,15 @@ file's own margins in m, at which contacts rest, and ``has_margins`` is 1 if the
 without −h J̇v. ``pressing`` counts the blocked contacts in penetration, and ``blocked`` is the
 address of h R N of each row in m/s, −1 where it is none; ``is_sparse`` is 1 if MuJoCo's Jacobian
 is. ``solver`` is the address of MuJoCo's choice, ``own_solver`` that of the scene; ``stalled`` is
-``STALLED``, ``paid`` ``PAID``. ``bounces`` is 1 if a contact or limit may bounce, ``rebounds`` the
-address of each row's e|v_n| in m/s, 0 where it is no blow, and ``rebound_ratio`` ρ of the step, 0
-without a blow; two buffers have a number per degree of freedom. Of limits and equality constraints:
-largest count of rows (0 if there are none), and addresses of the model's parameters, of copies, of
-the rows' own positions, of the velocities taken from ŵ and of J v⁺. Of margins: addresses and
-counts of the geoms that move, of pairs, and of the bodies' velocities; ``leashes`` is 1 for spatial
-tendons of no least length."""
+``STALLED``, ``paid`` ``PAID``, and beyond 1 Newton's rule alone. ``bounces`` is 1 if a contact or
+limit may bounce. ``blow_stage`` is ``COMPRESSION`` or ``RESTITUTION`` in a step with a blow, or 0;
+``rebound_ratio`` is ρ in restitution, else 0, and ``cuts`` counts the repetitions for impulses. Of
+each row that is a blow: e, −v_n in m/s, gap in m, a in m/s², P_c in N s and w in m/s, which is
+``NO_REBOUND`` where it is none. Two buffers have a number per degree of freedom. Of limits and
+equality constraints: largest count of rows (0 if there are none), and addresses of the model's
+parameters, of copies, of the rows' own positions, of the velocities taken from ŵ and of J v⁺. Of
+margins: addresses and counts of the geoms that move, of pairs, and of the bodies' velocities;
+``leashes`` is 1 for spatial tendons of no least length."""
 
 
 def bind_contact(
@@ -296,7 +309,7 @@ def bind_contact(
         owned[name] = np.zeros(max(int(contact["row_capacity"]), 1))
     is_spatial = model.wrap_type[model.tendon_adr] != mujoco.mjtWrap.mjWRAP_JOINT
     owned["leashes"] = (is_spatial & (model.tendon_range[:, 0] <= 0.0)).astype(np.int32)
-    for name in ("end_velocity", "blocked", "rebounds"):
+    for name in ("end_velocity", "blocked", *_OF_BLOWS):
         owned[name] = np.zeros(MAX_ROWS)
     for name in ("velocity_change", "momentum_change"):
         owned[name] = np.zeros(max(model.nv, 1))
@@ -395,12 +408,12 @@ def _aim(s: State) -> None:
         opened = opened_by_mocap(s, contact) if s.energy.mocap_has_moved else 0.0
         wanted -= max(max(opened, 0.0) - max(distance, 0.0), 0.0) / h
         rebound = _rebound(s, row)
-        if rebound > 0.0:
+        if rebound >= 0.0:
             wanted = max(wanted, _softened(rebound - opened / h, velocities[row]))
         stop = max(wanted - velocities[row], 0.0)
         lift = max(math.sqrt(slide) - friction[0] ** 2 * stop, 0.0)
         if s.contact.corrections > 0:
-            lift = math.sqrt(rest) if rebound > 0.0 else min(lift, math.sqrt(rest))
+            lift = math.sqrt(rest) if rebound >= 0.0 else min(lift, math.sqrt(rest))
         solimp, d = floats(contact + mj.contact_solimp, 2), _IMPEDANCE
         if row < MAX_ROWS and blocked[row] >= 0.0:
             slip = math.sqrt(rest if s.contact.corrections > 0 else slide)
@@ -564,8 +577,8 @@ def _aim_rows(s: State) -> None:
         if kind == EQUALITY and has_moved:
             wanted -= (1.0 - contact.push_ratio) * (own[row] - before[row]) / h
         wanted -= shifts[row]
-        rebound = _rebound(s, row) if kind != EQUALITY else 0.0
-        if rebound > 0.0:
+        rebound = _rebound(s, row) if kind != EQUALITY else -1.0
+        if rebound >= 0.0:
             wanted = max(wanted, _softened(rebound, velocities[row]))
         positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
         margins[row] = 0.0
@@ -636,37 +649,101 @@ def _unblock(s: State) -> bool:
 
 @compiled
 def _note_blows(s: State) -> None:
-    """Notes the contacts and limits that close in a blow, and their e|v_n| in m/s."""
+    """Notes the contacts and limits that close in a blow, and begins with their compression.
+
+    What presses in the step is not known before its forces are; that of the last step will do.
+    """
     mj, contact, h = s.mj, s.contact, s.run.timestep
-    count, contacts = min(ints(mj.nefc, 1)[0], MAX_ROWS), pointer_at(mj.contact)
-    rebounds = floats(contact.rebounds, count)
-    velocities, blocked = floats(pointer_at(mj.efc_vel), count), floats(contact.blocked, count)
+    count, contacts = ints(mj.nefc, 1)[0], pointer_at(mj.contact)
+    restitutions, blocked = floats(contact.restitutions, count), floats(contact.blocked, count)
+    velocities, positions = floats(pointer_at(mj.efc_vel), count), pointer_at(mj.efc_pos)
     kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
-    positions = floats(pointer_at(mj.efc_pos), count)
+    rebounds, free = floats(contact.rebounds, count), floats(contact.pressings, count)
+    mj_mul_jac(mj.model, mj.data, contact.pressings, contact.qacc_smooth)
     for row in range(count):
-        kind, i, rebounds[row] = kinds[row], ids[row], 0.0
+        kind, i, restitutions[row], rebounds[row] = kinds[row], ids[row], 0.0, NO_REBOUND
         if kind in (LIMIT_JOINT, LIMIT_TENDON) and row < contact.row_capacity:
-            gap = positions[row] - _limit_margin(s, kind, i) + h * velocities[row]
-            solref = _parameters_of(s, kind)[2] + 16 * i
-            rebounds[row] = rebound_speed(velocities[row], gap, solref)
+            gap = floats(positions, count)[row] - _limit_margin(s, kind, i)
+            if gap + h * (velocities[row] + h * min(free[row], 0.0)) <= 0.0:
+                solref = _parameters_of(s, kind)[2] + 16 * i
+                _note_blow(contact, row, gap, velocities[row], solref)
     for c in range(ints(mj.ncon, 1)[0]):
         one = contacts + c * mj.contact_size
         row = ints(one + mj.contact_row, 1)[0]
         if 0 <= row < count and blocked[row] < 0.0:
-            gap = opening(s, one) + h * velocities[row]
-            moved = opened_by_mocap(s, one) / h if s.energy.mocap_has_moved else 0.0
-            rebounds[row] = rebound_speed(velocities[row] + moved, gap, one + mj.contact_solref)
+            gap = opening(s, one)
+            moved = opened_by_mocap(s, one) if s.energy.mocap_has_moved else 0.0
+            if gap + h * (velocities[row] + h * min(free[row], 0.0)) <= 0.0:
+                solref = one + mj.contact_solref
+                _note_blow(contact, row, gap - moved, velocities[row] + moved / h, solref)
+
+
+@compiled
+def _note_blow(contact: Part, row: int, gap: float, velocity: float, solref: int) -> None:
+    """Notes e, −v_n and the gap at the start of a row that closes, if it is a blow."""
+    numbers = floats(solref, 2)
+    e = rigid_restitution(numbers[0], numbers[1]) if velocity < -BLOW_SPEED else 0.0
+    floats(contact.restitutions, row + 1)[row] = e
+    if e > 0.0:
+        floats(contact.approaches, row + 1)[row] = -velocity
+        floats(contact.gaps, row + 1)[row] = max(gap, 0.0)
+        floats(contact.rebounds, row + 1)[row] = 0.0
+        contact.blow_stage = COMPRESSION
+
+
+@compiled
+def _begin_restitution(s: State) -> None:
+    """Notes the impulses of the compression that just ended, and aims at the rebounds."""
+    mj, contact, h = s.mj, s.contact, s.run.timestep
+    count = ints(mj.nefc, 1)[0]
+    impulses, rebounds = floats(contact.impulses, count), floats(contact.rebounds, count)
+    gaps, pressings = floats(contact.gaps, count), floats(contact.pressings, count)
+    restitutions, approaches = (
+        floats(contact.restitutions, count),
+        floats(contact.approaches, count),
+    )
+    mj_mul_jac(mj.model, mj.data, contact.pressings, contact.qacc_smooth)
+    force = floats(pointer_at(mj.efc_force), count)
+    contact.blow_stage = contact.corrections = contact.cuts = 0
     for row in range(count):
-        if rebounds[row] > 0.0:
-            contact.rebound_ratio = 1.0
+        if rebounds[row] < 0.0:
+            continue
+        impulses[row], pressings[row] = h * force[row], max(-pressings[row], 0.0)
+        way = rebound_speed(restitutions[row], approaches[row], gaps[row], pressings[row], h)
+        rebounds[row] = way if way > 0.0 else NO_REBOUND
+        if way > 0.0:
+            contact.blow_stage, contact.rebound_ratio = RESTITUTION, 1.0
+
+
+@compiled
+def _cut_rebounds(s: State) -> bool:
+    """Lowers rebounds whose impulse is beyond (1 + e) P_c; returns True if there were any.
+
+    The impulse is P_c at ŵ = 0, and grows in proportion to ŵ while friction stays as it is.
+    """
+    contact, h, is_any = s.contact, s.run.timestep, False
+    if contact.cuts >= MAX_CORRECTIONS or contact.paid > 1.0:
+        return False
+    count = ints(s.mj.nefc, 1)[0]
+    impulses, rebounds = floats(contact.impulses, count), floats(contact.rebounds, count)
+    restitutions = floats(contact.restitutions, count)
+    force = floats(pointer_at(s.mj.efc_force), count)
+    for row in range(count):
+        beyond, returned = h * force[row] - impulses[row], restitutions[row] * impulses[row]
+        if rebounds[row] > 0.0 and beyond > (1.0 + REBOUND_ERROR) * returned:
+            rebounds[row] *= returned / beyond
+            is_any = True
+    contact.cuts += is_any
+    return is_any
 
 
 @compiled
 def _rebound(s: State, row: int) -> float:
-    """Returns ρ e|v_n| of a row in m/s, 0 where it is no blow."""
-    if s.contact.rebound_ratio == 0.0 or row >= MAX_ROWS:
-        return 0.0
-    return float(s.contact.rebound_ratio * floats(s.contact.rebounds, row + 1)[row])
+    """Returns the normal velocity in m/s at which a blow's row is aimed, negative if it is none."""
+    if s.contact.blow_stage == 0:
+        return NO_REBOUND
+    rebound = float(floats(s.contact.rebounds, row + 1)[row])
+    return s.contact.rebound_ratio * rebound if rebound > 0.0 else rebound
 
 
 @compiled
@@ -687,7 +764,7 @@ def _lower_rebound(contact: Part, allowed: float, returned: float) -> None:
     ratio = min(part / (2.0 - part), MAX_CUT * ratio)
     contact.rebound_ratio = ratio if ratio >= NOTABLE_BOUNCE else 0.0
     if contact.rebound_ratio == 0.0:
-        contact.corrections = 0
+        contact.corrections = contact.blow_stage = 0
 
 
 @compiled
@@ -701,12 +778,12 @@ def aim_contacts(s: State) -> None:
         has_energy = _spendable(s) > 0.0 or s.energy.mocap_has_moved
         contact.push_ratio = 1.0 if has_energy else 0.0
         contact.corrections = contact.is_shifted = contact.is_aimed = 0
-        contact.rebound_ratio = 0.0
+        contact.rebound_ratio, contact.blow_stage = 0.0, 0
         ints(contact.solver, 1)[0] = contact.own_solver
         _note_blocked(s)
         if contact.pressing:
             ints(s.mj.enableflags, 1)[0] &= ~_EXACT_DIAGONAL
-        if contact.bounces:
+        if contact.bounces and ints(s.mj.nefc, 1)[0] <= MAX_ROWS:
             _note_blows(s)
         _aim(s)
         contact.is_aimed = 1
@@ -779,6 +856,21 @@ def note_ends(s: State) -> None:
 
 
 @compiled
+def restitution_of(s: State, row: int, speed: float, end: float) -> tuple[float, float]:
+    """Returns e that a contact asks for in a blow, and the e that it had at the surface.
+
+    Its velocities are ``speed``, −v_n > 0 at the start of the step, and v_n at its ``end``, in m/s.
+    """
+    contact, h = s.contact, s.run.timestep
+    asked = float(floats(contact.restitutions, row + 1)[row]) if contact.bounces else 0.0
+    if asked == 0.0 or end <= 0.0:
+        return asked, max(end / speed, 0.0)
+    gap, pressing = floats(contact.gaps, row + 1)[row], floats(contact.pressings, row + 1)[row]
+    before = square_at_surface(speed, gap, pressing, h)
+    return asked, math.sqrt(square_at_surface(end, gap, pressing, h) / before)
+
+
+@compiled
 def _has_sunk(s: State) -> bool:
     """Returns True if a contact sank in the step because it slid less than at the start.
 
@@ -786,7 +878,7 @@ def _has_sunk(s: State) -> bool:
     """
     mj, h, contact = s.mj, s.run.timestep, s.contact
     count = ints(mj.nefc, 1)[0]
-    is_smooth = h * contact.lift <= SUNK and contact.rebound_ratio == 0.0
+    is_smooth = h * contact.lift <= SUNK and contact.blow_stage == 0
     if is_smooth or count > MAX_ROWS:
         return False
     note_ends(s)
@@ -798,11 +890,12 @@ def _has_sunk(s: State) -> bool:
         if row < 0 or ints(one + mj.contact_dim, 1)[0] == 1:
             continue
         rebound = _rebound(s, row)
-        if rebound > 0.0:
+        if rebound >= 0.0:
+            speed = rebound if rebound > 0.0 else floats(contact.approaches, row + 1)[row]
             if s.energy.mocap_has_moved:
                 rebound -= opened_by_mocap(s, one) / h
             error = abs(ends[row] - rebound) if force[row] > 0.0 else rebound - ends[row]
-            if error > REBOUND_ERROR * abs(rebound):
+            if error > REBOUND_ERROR * speed:
                 return True
             continue
         gap = max(opening(s, one), 0.0)
@@ -838,6 +931,19 @@ def _misses_force(s: State) -> bool:
 
 
 @compiled
+def _corrects(s: State) -> bool:
+    """Returns True if a contact sank or pressed otherwise than it should, or a blow goes on."""
+    contact = s.contact
+    if contact.corrections < MAX_CORRECTIONS and (_has_sunk(s) or _misses_force(s)):
+        contact.corrections += 1
+        return True
+    if contact.blow_stage == COMPRESSION:
+        _begin_restitution(s)
+        return True
+    return bool(contact.blow_stage == RESTITUTION and _cut_rebounds(s))
+
+
+@compiled
 def aim_again(s: State) -> bool:
     """Corrects the step that just ended: a solution that converges, less sinking, or less push.
 
@@ -852,15 +958,14 @@ def aim_again(s: State) -> bool:
     if _change_solver(s):
         contact.repetitions += 1
         return True
-    if contact.corrections < MAX_CORRECTIONS and (_has_sunk(s) or _misses_force(s)):
-        contact.corrections += 1
+    if _corrects(s):
         contact.repetitions += 1
         _aim(s)
         return True
     allowed, returned = max(_spendable(s), 0.0), returned_energy(s)
     if s.energy.mocap_has_moved:
         allowed += mocap_work(s)  # the external port pays for it
-    is_blow = contact.rebound_ratio > 0.0
+    is_blow = contact.blow_stage == RESTITUTION
     if is_blow:
         allowed += contact.paid * kinetic_loss(s)
     if returned <= allowed or not (
@@ -898,101 +1003,6 @@ def finish_contacts(s: State) -> None:
         if row >= 0:
             positions[row] = floats(contact + mj.contact_distance, 1)[0]
             s.contact.active_contacts += force[row] > 0.0
-
-
-@compiled
-def follow_speed(s: State) -> None:
-    """Widens each geom's margin for the next collisions by the way that it goes in a step.
-
-    The way is t (|v| + |ω| r), with the velocity v of the geom's centre and the radius r of its
-    bounding sphere, at most ``largest_margin``. t is the time step, or ``RESULTS_AHEAD`` periods of
-    a scene beside the loop. There the speed of the handle is added to that of the tool, which may
-    reach it within a step. Positions are those at the start of the last step. Limits of joints and
-    tendons follow their speeds.
-    """
-    contact, mj, ahead = s.contact, s.mj, s.contact.ahead
-    widest = contact.largest_margin
-    _move_bodies(s)
-    velocities, centres = floats(contact.body_velocity, 6 * mj.nbody), contact.geom_xpos
-    bodies, roots = ints(mj.geom_bodyid, mj.ngeom), ints(contact.body_rootid, mj.nbody)
-    margins, at_rest = (
-        floats(contact.geom_margin, mj.ngeom),
-        floats(contact.own_geom_margin, mj.ngeom),
-    )
-    radii = floats(contact.geom_rbound, mj.ngeom)
-    for geom in ints(contact.moving_geoms, contact.moving_count):
-        body = bodies[geom]
-        centre = vector_of(floats(centres + 24 * geom, 3))
-        origin = vector_of(floats(contact.subtree_com + 24 * roots[body], 3))
-        turn = vector_of(velocities[6 * body : 6 * body + 3])
-        velocity = vector_of(velocities[6 * body + 3 : 6 * body + 6])
-        velocity = add(velocity, cross(turn, subtract(centre, origin)))
-        way = ahead * (norm(velocity) + radii[geom] * norm(turn)) + contact.flight
-        if contact.leads and ints(mj.geom_is_tool, mj.ngeom)[geom]:
-            way += RESULTS_AHEAD * _handle_way(s, centre, radii[geom])
-        margins[geom] = at_rest[geom] + (way if way < widest else widest)
-    for pair in range(contact.pair_count):
-        way = 0.0
-        for geoms in (contact.pair_geom1, contact.pair_geom2):
-            geom = ints(geoms + 4 * pair, 1)[0]
-            way += margins[geom] - at_rest[geom]
-        at_rest_here = floats(contact.own_pair_margin + 8 * pair, 1)[0]
-        floats(contact.pair_margin + 8 * pair, 1)[0] = at_rest_here + way
-    if contact.row_capacity > 0:
-        _follow_limits(s)
-
-
-@compiled
-def _handle_way(s: State, centre: Vector, radius: float) -> float:
-    """Returns the way in m by which the handle's motion of this tick would move a geom."""
-    turn = vector_of(s.pose.handle_turn)
-    arm = subtract(centre, vector_of(s.pose.tool_position))
-    return norm(add(vector_of(s.pose.handle_step), cross(turn, arm))) + radius * norm(turn)
-
-
-@compiled
-def _follow_limits(s: State) -> None:
-    """Widens the margins of limits by ``MARGIN``, in m or rad, and the way of two steps.
-
-    In the first of these steps a lossless tool learns that it is near. A leash, a spatial tendon of
-    no least length, may pass through zero: its lower limit stays out of the step.
-    """
-    contact, mj, ahead = s.contact, s.mj, 2.0 * s.run.timestep
-    kinds, first = ints(contact.jnt_type, mj.njnt), ints(contact.jnt_dofadr, mj.njnt)
-    speeds = floats(mj.qvel, mj.nv)
-    margins, own = floats(contact.jnt_margin, mj.njnt), floats(contact.own_jnt_margin, mj.njnt)
-    for joint in range(mj.njnt):
-        dof = first[joint]
-        speed = abs(speeds[dof])
-        if kinds[joint] == _BALL:
-            speed = norm(vector_of(speeds[dof : dof + 3]))
-        margins[joint] = own[joint] + MARGIN + (ahead * speed + contact.flight)
-    margins = floats(contact.tendon_margin, mj.ntendon)
-    own = floats(contact.own_tendon_margin, mj.ntendon)
-    speeds = floats(contact.ten_velocity, mj.ntendon)
-    lengths, leashes = floats(mj.ten_length, mj.ntendon), ints(contact.leashes, mj.ntendon)
-    for tendon in range(mj.ntendon):
-        way = ahead * abs(speeds[tendon]) + contact.flight
-        wide = MARGIN + way
-        if leashes[tendon]:
-            wide = min(wide, max(lengths[tendon] - way, 0.0))
-        margins[tendon] = own[tendon] + wide
-
-
-@compiled
-def _move_bodies(s: State) -> None:
-    """Computes the bodies' velocities from those of the joints, as MuJoCo's ``cvel``."""
-    contact, mj = s.contact, s.mj
-    parents = ints(contact.body_parentid, mj.nbody)
-    first, number = ints(contact.body_dofadr, mj.nbody), ints(contact.body_dofnum, mj.nbody)
-    axes, speeds = floats(contact.cdof, 6 * mj.nv), floats(mj.qvel, mj.nv)
-    velocities = floats(contact.body_velocity, 6 * mj.nbody)
-    for body in range(1, mj.nbody):
-        for i in range(6):
-            velocities[6 * body + i] = velocities[6 * parents[body] + i]
-        for dof in range(first[body], first[body] + number[body]):
-            for i in range(6):
-                velocities[6 * body + i] += axes[6 * dof + i] * speeds[dof]
 
 
 @compiled

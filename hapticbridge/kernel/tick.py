@@ -53,6 +53,7 @@ from hapticbridge.kernel.codes import (
     State,
 )
 from hapticbridge.kernel.compared_methods import compared_wrench, drive_compared
+from hapticbridge.kernel.contact_margins import follow_speed
 from hapticbridge.kernel.explicit_bias import take_back, take_mean_bias_in_substep
 from hapticbridge.kernel.force_level import (
     keep_state,
@@ -142,7 +143,7 @@ from hapticbridge.kernel.pose import (
     subtract,
     vector_of,
 )
-from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, finish_contacts, follow_speed
+from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, finish_contacts
 from hapticbridge.kernel.shown_tool import (
     hand_over,
     note_contacts,
