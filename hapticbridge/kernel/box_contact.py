@@ -34,7 +34,7 @@ CONE = 0.02
 """Angle in rad by which a normal may lie outside a feature's normal cone. Faces that lie on each
 other within this angle keep all their points, so a point is known before the faces are parallel. A
 larger angle adds points that do not touch soon, each a row of the solver. Bodies with a margin
-that their speed widens by m (``rigid_contact.follow_speed``) turn by up to m/r in a step, r being
+that their speed widens by m (``contact_margins.follow_speed``) turn by up to m/r in a step, r being
 the radius of the smaller one, and count within that angle, up to ``WIDEST``."""
 
 WIDEST = 0.5
