@@ -66,13 +66,14 @@ def test_check_says_what_a_device_can_answer_a_tap_with(call: Called) -> None:
     kept = math.exp(-1e-3 / 0.0125) * tap["burned"]  # of wood, after the account's first tick
     assert tap["pulse"] == pytest.approx(2 * math.sqrt(tap["spare"] * kept / 1e-3))
     out = call("check", "virtual_wall")[1]
-    assert (
-        "impact pulses        a tap at 0.2 m/s burns up to 1 mJ, for a pulse of up to 1.05 N" in out
+    words = (
+        "a tap at 0.2 m/s takes up to 1 mJ from the tool, which pays for a pulse of up to 1.05 N"
     )
+    assert f"impact pulses        {words} on the hand" in out
     assert facts_of(call, "check", "virtual_wall", "--contact", "scene")[1]["tap"] is None
     assert "impact pulses" not in call("check", "virtual_wall", "--contact", "scene")[1]
     # its pawl turns on the tool
-    assert "impact pulses        none is given: no geom" in call("check", "ratchet")[1]
+    assert "impact pulses        no blow pays for a pulse: no geom" in call("check", "ratchet")[1]
 
 
 def test_a_pulse_that_is_none_is_told_and_refused_by_a_run_that_needs_it(
@@ -100,7 +101,7 @@ def test_run_and_check_foresee_the_same_tap(call: Called, tmp_path: Path) -> Non
         <body name="tool" pos="0 0 .1"><freejoint/><geom type="box" size=".01 .01 .01" mass=".2"/>
         <site name="grip"/></body></worldbody></mujoco>"""
     )
-    words = "a tap at 0.2 m/s burns up to 4 mJ"
+    words = "a tap at 0.2 m/s takes up to 4 mJ"
     _, _, err = call("run", scene, "--fast", "--duration", 0.1, "--impact-pulses", 1)
     assert words in " ".join(err.split())
     assert words in " ".join(call("check", scene)[1].split())

@@ -125,7 +125,9 @@ def test_a_missing_sample_ends_the_pulse() -> None:
     taps = tapping()
     struck(taps, 0.3, 3)
     assert taps.rows[-1]["pulse"][0] != 0.0
+    assert taps.pulse["ended_by"] == 0
     assert taps.tick(towards(0.3), is_stale=True)["pulse"][0] == 0.0
+    assert taps.pulse["ended_by"] == TickFlag.STALE_SAMPLE
     assert taps.tick(towards(0.3))["pulse"][0] == 0.0
 
 
@@ -137,6 +139,7 @@ def test_a_pulse_follows_the_lever_and_ends_with_it() -> None:
         row = taps.tick(towards(0.0))
         assert abs(row["pulse"][0]) <= row["lever"] * taps.pulse["amplitude"] * (1 + 1e-12)
     assert (row["lever"], row["pulse"][0]) == (0.0, 0.0)
+    assert taps.pulse["ended_by"] == TickFlag.RAMPING
     taps.sample["buttons"] = 0
     for _ in range(6):
         assert taps.tick(towards(0.0))["pulse"][0] == 0.0
@@ -402,7 +405,7 @@ def test_a_pulse_may_act_a_tick_later_on_a_real_device(is_real: bool, ticks: int
     [
         ({"contact": "scene"}, r"impact-pulses is 0\.5, but contact is 'scene'"),
         ({"scene_rate": 100.0}, "a step in every tick"),
-        ({"rate": 500.0, "pulse": "300,5"}, "at most half the rate, 250"),
+        ({"rate": 500.0, "pulse": "300,5"}, "at most 250 Hz, half the rate"),
     ],
 )
 def test_runs_that_have_no_pulses_refuse_them_before_they_begin(

@@ -125,10 +125,10 @@ def announce(setup: RunSetup, named: Mapping[str, float], *, is_method_chosen: b
             "way (--no-probe)"
         )
     if setup.impact_pulses:
-        (frequency, decay), tap = setup.pulse, setup.tap()
+        frequency, decay = setup.pulse
         err.print(
-            f"  a blow of the tool gives a pulse of {frequency:g} Hz that falls to 37 % in "
-            f"{format_si(decay, 's')}; {tap_words(tap)}"
+            f"  after a blow of the tool the device gets a pulse of force of {frequency:g} Hz, "
+            f"which falls to 37 % in {format_si(decay, 's')}; {tap_words(setup.tap())}"
         )
     _announce_damping(setup, named)
     _announce_own_rate(setup)
