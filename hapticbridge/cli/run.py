@@ -74,6 +74,7 @@ from hapticbridge.scene.fault import weight
 from hapticbridge.scene.first_faults import worst_faults
 from hapticbridge.scene.physics import tool_masses
 from hapticbridge.scene.rehearsal import static_load
+from hapticbridge.scene.softness import bounces
 from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
 from hapticbridge.units import format_energy, format_number, format_si
 
@@ -115,6 +116,12 @@ def announce(setup: RunSetup, named: Mapping[str, float], *, is_method_chosen: b
         has_several = setup.scene.has_several_hands
         reason = unsuited_reason(usual, setup.substeps, has_several_hands=has_several)
         err.print(f"  {method.name}, because {usual.name} {reason}")
+    if not method.is_rigid and (bouncing := bounces(setup.scene.model)):
+        err.print(
+            f"  MuJoCo's springs bounce by themselves: {plain('; '.join(map(str, bouncing)))}; how "
+            "far depends on the time step, and may be higher than the fall (rigid contacts, the "
+            "default, bounce as impacts that pay for it)"
+        )
     if method.hazard:
         err.print(f"[yellow]warning:[/yellow] {escape(method.hazard)}")
     if setup.scene_ticks:
