@@ -12,6 +12,7 @@ import pytest
 from kernel_runs import T, load
 from tapping import COUPLING, SPARE, parameters_of, tapping, towards, wall
 
+from hapticbridge.cli.guide import page
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.pulse import (
     FORCE_FLOOR,
@@ -125,6 +126,15 @@ def test_a_scene_names_its_pulse_and_the_option_overrides_it(tmp_path: Path) -> 
     ):
         with pytest.raises(HapticBridgeError, match=message):
             pulse(named, impact_pulses=1.0, rate=rate)
+
+
+def test_the_guide_has_the_presets() -> None:
+    rows = [line.split("|")[1:5] for line in page("rigid-contact").splitlines() if "| `" in line]
+    found = [[cell.strip() for cell in row] for row in rows]
+    assert found == [
+        [f"`{name}`", f"{frequency:g}", f"{1e3 * decay:g}", f"{1 / decay:.0f}"]
+        for name, (frequency, decay) in PULSES.items()
+    ]
 
 
 def test_the_hammer_rings_like_steel() -> None:

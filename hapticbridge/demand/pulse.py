@@ -23,10 +23,9 @@ from hapticbridge.units import format_energy, format_si
 PULSES = {"steel": (300.0, 0.011), "wood": (100.0, 0.0125), "rubber": (30.0, 0.0167)}
 """Frequency in Hz and time constant in s of the pulse of a blow on a material. A tap on a real
 material shakes a stylus in a decaying sinusoid, and users rated other numbers than the measured
-ones as real (Okamura, Cutkosky & Dennerlein 2001). These are of the order that is known for
-aluminium, wood and rubber; no table of theirs was at hand to check them. Others feel like another
-material, and pulses of the same kind that were tuned by hand made taps on wood more real
-(Kuchenbecker, Fiene & Niemeyer 2006)."""
+ones as real (Okamura, Cutkosky & Dennerlein 2001). These are our choice, of the order that is known
+for aluminium, wood and rubber; no table of theirs was at hand to check them. Other numbers feel
+like another material."""
 
 USUAL_PULSE = "wood"
 """Pulse of a scene that names none."""
