@@ -26,6 +26,7 @@ from tapping import (
     towards,
     wall,
 )
+from view_cases import tapped_wall
 
 from hapticbridge.audit import audit
 from hapticbridge.coupling import Coupling
@@ -427,25 +428,7 @@ def test_several_hands_have_no_pulses() -> None:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     folder = tmp_path_factory.mktemp("pulse")
-    scene, motion = folder / "wall.xml", folder / "tap.csv"
-    scene.write_text(wall())
-    motion.write_text(
-        "t,x,y,z,qw,qx,qy,qz\n0,0,0,0,1,0,0,0\n0.2,0.05,0,0,1,0,0,0\n"
-        "0.3,0,0,0,1,0,0,0\n0.45,0.05,0,0,1,0,0,0\n"
-    )
-    device = SimulatedDevice(damping=DAMPING, path=str(motion))
-    path, limits = folder / "run.mcap", Limits(force=8.0, torque=0.5)
-    recorded(
-        path,
-        scene,
-        device,
-        Coupling(1000.0, 0.5, 1.0, 5e-4),
-        duration=0.5,
-        controller=None,
-        impact_pulses=0.5,
-        limits=limits,
-    )
-    return read_recording(path)
+    return read_recording(tapped_wall(folder, controller=None, impact_pulses=0.5))
 
 
 def test_a_recorded_run_is_strict_certified_and_audited_to_the_bit(run: Recording) -> None:

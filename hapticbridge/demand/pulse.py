@@ -7,17 +7,10 @@ from dataclasses import dataclass
 
 from hapticbridge.arguments import shown
 from hapticbridge.errors import HapticBridgeError, choices
-from hapticbridge.kernel.codes import (
-    CONTROLLER_ACTIVE,
-    PROBED,
-    RAMPING,
-    RUNS_AWAY,
-    STALE_SAMPLE,
-    SWINGING,
-)
 from hapticbridge.kernel.impact_pulse import largest_pulse
 from hapticbridge.kernel.jit import source_of
 from hapticbridge.kernel.parameters import LONGEST_DECAY, SHORTEST_DECAY, RunParameters
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.units import format_energy, format_si
 
 PULSES = {"steel": (300.0, 0.011), "wood": (100.0, 0.0125), "rubber": (30.0, 0.0167)}
@@ -116,12 +109,12 @@ def tap_words(tap: Tap | None) -> str:
 
 
 _ENDS = {
-    STALE_SAMPLE: "a missing sample",
-    CONTROLLER_ACTIVE: "the passivity controller",
-    SWINGING: "the watch, because the device swung",
-    RUNS_AWAY: "the watch, because the device went the wrong way",
-    PROBED: "the watch, which tried the device",
-    RAMPING: "the guard, which held the force back",
+    TickFlag.STALE_SAMPLE: "a missing sample",
+    TickFlag.CONTROLLER_ACTIVE: "the passivity controller",
+    TickFlag.SWINGING: "the watch, because the device swung",
+    TickFlag.RUNS_AWAY: "the watch, because the device went the wrong way",
+    TickFlag.PROBED: "the watch, which tried the device",
+    TickFlag.RAMPING: "the guard, which held the force back",
 }
 """Causes that end a pulse early, by the flag of ``ENDS``."""
 

@@ -196,9 +196,9 @@ class BridgeOptions:
         impact_pulses: Share of the energy that a blow of the tool burns, 0 to 1, which may pay for
             a short pulse of force on the device: a tap then feels crisp. It needs rigid contact.
             Damping of the device beyond what the coupling needs makes it stronger.
-        pulse: Pulse of a blow: 'steel', 'wood' or 'rubber', or HZ,MS for its frequency in Hz and
-            the time in ms in which it falls to 37 %. 'scene', the default, takes the one that the
-            scene's custom text 'pulse' names, or 'wood'.
+        pulse: Pulse of a blow, with --impact-pulses: 'steel', 'wood' or 'rubber', or HZ,MS for its
+            frequency in Hz and the time in ms in which it falls to 37 %. 'scene', the default,
+            takes the one that the scene's custom text 'pulse' names, or 'wood'.
         realtime: Request real-time priority and locked memory for the loop, and print what the
             system refuses (see 'hapticbridge doctor'). By default requested for a real device.
         pipelined: Compute ahead, after the wrench was sent, what needs no new sample. The numbers
