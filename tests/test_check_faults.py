@@ -54,7 +54,7 @@ CONSEQUENCES = CREATED | {"MuJoCo warning", "solver iterations", "own motion"}
 
 CURED = {
     *("solver iterations", "pyramidal cone", "default contact", "not passive"),
-    *("margin", "soft limit", "soft equality"),
+    *("soft limit", "soft equality"),
 }
 """Faults of a scene's own constraints that a run with rigid contacts cures."""
 
@@ -131,6 +131,23 @@ def test_an_impossible_inertia_is_told_with_its_stand_in(tmp_path: Path) -> None
     fault = one_of(plant.kind, found)
     assert "judged with 0.01 kg and 1e-06 kg m²" in fault.sentence
     assert 'balanceinertia="true"' in fault.change
+
+
+@pytest.mark.parametrize(("flag", "names"), [("", ["'plate'", "'ball'"]), ("enable", [])])
+def test_margins_at_which_a_ball_bounces_are_named(
+    tmp_path: Path, flag: str, names: list[str]
+) -> None:
+    """Such a ball comes to rest 6.000 mm above the plate, whatever the gaps are."""
+    option = f'<option><flag override="{flag}"/></option>' if flag else ""
+    plate = 'name="plate" type="box" size=".1 .1 .01" pos="0 0 -.1" margin=".004" gap=".002"'
+    ball = '<geom name="ball" size=".02" mass=".02" margin=".002"/>'
+    text = f"""<mujoco>{option}<default><geom solref=".02 .1"/></default><worldbody>
+    <geom {plate}/><body pos=".1 0 0"><freejoint/>{ball}</body>
+    <body gravcomp="1"><freejoint/><geom size=".02" mass=".5"/><site name="grip"/></body>
+    </worldbody></mujoco>"""
+    found = [each for each in faults_in(tmp_path, text) if each.kind == "margin"]
+    assert [each.place.element for each in found] == [f"geom {name}" for name in names]
+    assert all("rest, and bounce, that far" in each.sentence for each in found)
 
 
 def test_all_planted_faults_are_named_together(tmp_path: Path) -> None:

@@ -66,6 +66,10 @@ OF_THEIR_OWN = {
 """Values of flags by the last part of their path, where the type and rule do not tell one."""
 
 
+NEEDED = {"pulse": ("--impact-pulses", "1")}
+"""Words without which a flag is refused, by the name of its field."""
+
+
 def text_for(flag: Flag) -> list[str]:
     """Returns words for a value of a flag's type that its rule admits."""
     kinds = flag.of_tuple[:1] or members(flag.kind)
@@ -99,7 +103,8 @@ def test_a_flag_reaches_its_field(kind: Any, each: Field[Any]) -> None:
     flag = flag_of(kind, each)
     for word, value in flag.words.items():
         words = [] if flag.count == 0 else text_for(flag)
-        made = built(Run, values_of(Run, "run", ["peg_in_hole", word, *words]))
+        needed = NEEDED.get(each.name, ())
+        made = built(Run, values_of(Run, "run", ["peg_in_hole", *needed, word, *words]))
         for name in flag.path:
             made = made[name] if isinstance(made, dict) else getattr(made, name)
         assert made == value if flag.count == 0 else made != each.default

@@ -12,6 +12,8 @@ import pytest
 from kernel_runs import T, load
 from tapping import COUPLING, SPARE, parameters_of, tapping, towards, wall
 
+from hapticbridge.cli.guide import page
+from hapticbridge.coupling import Coupling
 from hapticbridge.demand.pulse import (
     FORCE_FLOOR,
     PULSES,
@@ -25,6 +27,7 @@ from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.options import BridgeOptions
+from hapticbridge.whatif.settings import Settings
 
 MASS = 0.1
 """Mass of the tapping tool in kg."""
@@ -73,13 +76,34 @@ def test_words_of_a_tap_say_what_is_spare_and_what_is_too_weak() -> None:
 
 
 def test_names_and_numbers_of_pulses() -> None:
-    assert pulse_of("steel") == PULSES["steel"]
-    assert pulse_of("250,8") == (250.0, 0.008)
-    assert pulse_of("0,0.1") == (0.0, 1e-4)
+    assert pulse_of("steel", 600.0) == PULSES["steel"]
+    assert pulse_of("250,8", 500.0) == (250.0, 0.008)
+    assert pulse_of("0,0.1", 1.0) == (0.0, 1e-4)
     wrong = ("gold", "250", "250,0", "-1,8", "nan,8", "1,2,3", "1e-400,1e-320", "9,0.09", "9,1001")
-    for text in wrong:
+    for text in (*wrong, "501,8"):
         with pytest.raises(HapticBridgeError, match=r"pulse is .*; it must be one of .* HZ,MS"):
-            BridgeOptions(pulse=text)
+            BridgeOptions(pulse=text, impact_pulses=1.0)
+
+
+@pytest.mark.parametrize(
+    ("rate", "valid"),
+    [(599.0, "one of 'rubber', 'wood', or HZ,MS with at most 299.5 Hz"), (59.0, "HZ,MS with at")],
+)
+def test_a_pulse_too_fast_for_the_rate_is_refused_with_those_that_are_not(
+    rate: float, valid: str
+) -> None:
+    message = f"pulse is 'steel' of 300 Hz; it must be {valid}"
+    with pytest.raises(HapticBridgeError, match=message):
+        BridgeOptions(pulse="steel", impact_pulses=1.0, rate=rate)
+
+
+def test_a_pulse_that_no_blow_gives_is_refused_and_goes_with_the_pulses() -> None:
+    with pytest.raises(HapticBridgeError, match="pulse is 'steel', but impact-pulses is 0"):
+        BridgeOptions(pulse="steel")
+    options = BridgeOptions(pulse="steel", impact_pulses=1.0, method="lossless")
+    given = Settings(coupling=Coupling(100.0, 1.0, 1.0, 0.01), options=options, scene={})
+    assert given.changed({"impact_pulses": 0.0}).options.pulse == BridgeOptions().pulse
+    assert given.changed({"impact_pulses": 0.5}).options.pulse == "steel"
 
 
 def test_a_scene_names_its_pulse_and_the_option_overrides_it(tmp_path: Path) -> None:
@@ -95,8 +119,22 @@ def test_a_scene_names_its_pulse_and_the_option_overrides_it(tmp_path: Path) -> 
     assert pulse("steel", impact_pulses=1.0, pulse="rubber") == PULSES["rubber"]
     assert pulse("", impact_pulses=1.0) == PULSES["wood"]
     assert pulse("a heart's") == PULSES["wood"]  # a run without pulses does not read it
-    with pytest.raises(HapticBridgeError, match=r"custom text 'pulse' is 'gold'; it must be one"):
-        pulse("gold", impact_pulses=1.0)
+    for named, rate, message in (
+        ("gold", 1000.0, "the scene's custom text 'pulse' is 'gold'; .*; --pulse replaces it"),
+        ("steel", 500.0, "the scene's custom text 'pulse' is 'steel' of 300 Hz; .* 'wood', or"),
+        ("", 150.0, "the usual pulse is 'wood' of 100 Hz; it must be one of 'rubber', or HZ,MS"),
+    ):
+        with pytest.raises(HapticBridgeError, match=message):
+            pulse(named, impact_pulses=1.0, rate=rate)
+
+
+def test_the_guide_has_the_presets() -> None:
+    rows = [line.split("|")[1:5] for line in page("rigid-contact").splitlines() if "| `" in line]
+    found = [[cell.strip() for cell in row] for row in rows]
+    assert found == [
+        [f"`{name}`", f"{frequency:g}", f"{1e3 * decay:g}", f"{1 / decay:.0f}"]
+        for name, (frequency, decay) in PULSES.items()
+    ]
 
 
 def test_the_hammer_rings_like_steel() -> None:

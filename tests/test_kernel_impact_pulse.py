@@ -26,6 +26,7 @@ from tapping import (
     towards,
     wall,
 )
+from view_cases import tapped_wall
 
 from hapticbridge.audit import audit
 from hapticbridge.coupling import Coupling
@@ -125,7 +126,9 @@ def test_a_missing_sample_ends_the_pulse() -> None:
     taps = tapping()
     struck(taps, 0.3, 3)
     assert taps.rows[-1]["pulse"][0] != 0.0
+    assert taps.pulse["ended_by"] == 0
     assert taps.tick(towards(0.3), is_stale=True)["pulse"][0] == 0.0
+    assert taps.pulse["ended_by"] == TickFlag.STALE_SAMPLE
     assert taps.tick(towards(0.3))["pulse"][0] == 0.0
 
 
@@ -137,6 +140,7 @@ def test_a_pulse_follows_the_lever_and_ends_with_it() -> None:
         row = taps.tick(towards(0.0))
         assert abs(row["pulse"][0]) <= row["lever"] * taps.pulse["amplitude"] * (1 + 1e-12)
     assert (row["lever"], row["pulse"][0]) == (0.0, 0.0)
+    assert taps.pulse["ended_by"] == TickFlag.RAMPING
     taps.sample["buttons"] = 0
     for _ in range(6):
         assert taps.tick(towards(0.0))["pulse"][0] == 0.0
@@ -402,7 +406,7 @@ def test_a_pulse_may_act_a_tick_later_on_a_real_device(is_real: bool, ticks: int
     [
         ({"contact": "scene"}, r"impact-pulses is 0\.5, but contact is 'scene'"),
         ({"scene_rate": 100.0}, "a step in every tick"),
-        ({"rate": 500.0, "pulse": "300,5"}, "at most half the rate, 250"),
+        ({"rate": 500.0, "pulse": "300,5"}, "at most 250 Hz, half the rate"),
     ],
 )
 def test_runs_that_have_no_pulses_refuse_them_before_they_begin(
@@ -424,25 +428,7 @@ def test_several_hands_have_no_pulses() -> None:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     folder = tmp_path_factory.mktemp("pulse")
-    scene, motion = folder / "wall.xml", folder / "tap.csv"
-    scene.write_text(wall())
-    motion.write_text(
-        "t,x,y,z,qw,qx,qy,qz\n0,0,0,0,1,0,0,0\n0.2,0.05,0,0,1,0,0,0\n"
-        "0.3,0,0,0,1,0,0,0\n0.45,0.05,0,0,1,0,0,0\n"
-    )
-    device = SimulatedDevice(damping=DAMPING, path=str(motion))
-    path, limits = folder / "run.mcap", Limits(force=8.0, torque=0.5)
-    recorded(
-        path,
-        scene,
-        device,
-        Coupling(1000.0, 0.5, 1.0, 5e-4),
-        duration=0.5,
-        controller=None,
-        impact_pulses=0.5,
-        limits=limits,
-    )
-    return read_recording(path)
+    return read_recording(tapped_wall(folder, controller=None, impact_pulses=0.5))
 
 
 def test_a_recorded_run_is_strict_certified_and_audited_to_the_bit(run: Recording) -> None:

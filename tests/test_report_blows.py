@@ -7,12 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from audit_cases import recorded
+from audit_cases import ScriptedDevice, recorded
+from tapping import DAMPING as B
+from tapping import wall
+from view_cases import tap
 
 from hapticbridge.audit import audit
+from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.pulse import balance_words
 from hapticbridge.device.simulated.device import SimulatedDevice
 from hapticbridge.kernel.jit import source_of
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.kernel.restitution import restitution
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.report import write_report
@@ -89,10 +95,39 @@ def test_the_summary_has_what_blows_paid_and_what_pulses_did(
     summary: Summary, blows: list[Blow]
 ) -> None:
     assert summary.pulses is not None
-    paid, worked = summary.pulses
+    paid, worked, ended_by = summary.pulses
+    assert ended_by == 0
+    assert not any(blow.ended_by for blow in blows)
     assert paid == pytest.approx(sum(blow.paid for blow in blows), rel=1e-6)
     assert worked == pytest.approx(sum(blow.worked for blow in blows), abs=1e-6)
-    assert f"paid {format_energy(paid)} by blows" in str(summary)
+    gave = f"blows gave them {format_energy(paid)}, the hand gave them {format_energy(-worked)}"
+    assert gave in str(summary)
+    assert balance_words(2.0, 1.0, 0).endswith("gave them 2 J, they gave the hand 1 J")
+
+
+def test_a_pulse_that_ends_early_is_told_with_its_cause(tmp_path: Path) -> None:
+    device = ScriptedDevice(tap, damping=B, is_stale=lambda tick: tick < 200 and tick % 7 < 1)
+    scene = tmp_path / "wall.xml"
+    scene.write_text(wall())
+    summary = recorded(
+        tmp_path / "run.mcap",
+        scene,
+        device,
+        Coupling(1000.0, 0.5, 1.0, 5e-4),
+        duration=0.6,
+        impact_pulses=1.0,
+        limits=Limits(force=8.0, torque=0.5),
+    )
+    assert summary.pulses is not None
+    assert summary.pulses[2] == TickFlag.STALE_SAMPLE
+    assert "; cut short by a missing sample" in str(summary)
+    run = read_recording(tmp_path / "run.mcap")
+    evidence, page = Evidence.of(run), tmp_path / "page.html"
+    assert evidence is not None
+    first, last = blows_of(evidence)
+    assert (first.ended_by, last.ended_by) == (TickFlag.STALE_SAMPLE, 0)
+    write_report(run, audit(run.path), page)
+    assert page.read_text().count("<td>a missing sample</td>") == 1
 
 
 def test_the_energies_of_a_blow_are_those_of_two_bodies(blows: list[Blow]) -> None:

@@ -57,7 +57,7 @@ def tapped_wall(folder: Path, **how: Any) -> Path:
     device, coupling = ScriptedDevice(tap, damping=DAMPING), Coupling(1000.0, 0.5, 1.0, 5e-4)
     limits = Limits(force=8.0, torque=0.5, ramp=0.0)
     pulses: dict[str, Any] = {"impact_pulses": 1.0, "limits": limits}
-    recorded(path, scene, device, coupling, duration=0.6, **pulses, **how)
+    recorded(path, scene, device, coupling, duration=0.6, **(pulses | how))
     return path
 
 

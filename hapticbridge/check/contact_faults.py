@@ -272,20 +272,25 @@ def pair_names(case: SceneUnderCheck, pairs: list[tuple[int, int]]) -> str:
 
 
 def margin_faults(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Yields geoms and pairs whose contacts push before they touch; rigid ones do not."""
-    if case.is_rigid:
-        return
+    """Yields geoms and pairs whose contacts push, or rest if they are rigid, before they touch."""
     model, places = case.model, case.places
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
+        return
     meeting = {geom for first, second, _ in settings_among(model) for geom in (first, second)}
     found = [(places.geom(geom), float(model.geom_margin[geom])) for geom in sorted(meeting)]
     found += [(places.pair(p), float(model.pair_margin[p])) for p in range(model.npair)]
+    does = "it pushes that far before it is touched, and the force jumps where it begins"
+    if case.is_rigid:
+        does = (
+            "its contacts rest, and bounce, that far before they touch; margins of two geoms add "
+            "up, and a gap changes nothing"
+        )
     for place, margin in found:
         if margin > 0:
             yield Fault(
                 "margin",
                 place,
-                f"{place.element} has a margin of {1e3 * margin:g} mm: it pushes that far before "
-                "it is touched, and the force jumps where it begins",
+                f"{place.element} has a margin of {1e3 * margin:g} mm: {does}",
                 'margin="0"',
             )
 

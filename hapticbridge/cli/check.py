@@ -174,14 +174,14 @@ def _blow_lines(inventory: Inventory, contact: str, tapped: str) -> dict[str, st
     """Returns what a blow does in the scene and on the device, by the head of its line."""
     lines = {}
     if inventory.bounces:
-        each = (f"{one.names}, e at most {one.e:.2g}" for one in inventory.bounces)
         e = max(one.e for one in inventory.bounces)
         back = (
             f"1 m/s comes back as {e:.2g} m/s, a fall of 100 mm rebounds to {100.0 * e * e:.2g} mm"
             if contact == RIGID
             else "how far depends on the time step, too"
         )
-        lines["bounces"] = f"{'; '.join(each)} ({_BOUNCES[contact]}):\n{'':23}{back}"
+        each = "; ".join(map(str, inventory.bounces))
+        lines["bounces"] = f"{each} ({_BOUNCES[contact]}):\n{'':23}{back}"
     if contact == RIGID and inventory.geoms[TOOL]:
         lines["impact pulses"] = f"{tapped} (--impact-pulses 1)"
     return lines

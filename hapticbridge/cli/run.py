@@ -74,6 +74,7 @@ from hapticbridge.scene.fault import weight
 from hapticbridge.scene.first_faults import worst_faults
 from hapticbridge.scene.physics import tool_masses
 from hapticbridge.scene.rehearsal import static_load
+from hapticbridge.scene.softness import bounces
 from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
 from hapticbridge.units import format_energy, format_number, format_si
 
@@ -115,6 +116,12 @@ def announce(setup: RunSetup, named: Mapping[str, float], *, is_method_chosen: b
         has_several = setup.scene.has_several_hands
         reason = unsuited_reason(usual, setup.substeps, has_several_hands=has_several)
         err.print(f"  {method.name}, because {usual.name} {reason}")
+    if not method.is_rigid and (bouncing := bounces(setup.scene.model)):
+        err.print(
+            f"  MuJoCo's springs bounce by themselves: {plain('; '.join(map(str, bouncing)))}; how "
+            "far depends on the time step, and may be higher than the fall (rigid contacts, the "
+            "default, bounce as impacts that pay for it)"
+        )
     if method.hazard:
         err.print(f"[yellow]warning:[/yellow] {escape(method.hazard)}")
     if setup.scene_ticks:
@@ -125,10 +132,10 @@ def announce(setup: RunSetup, named: Mapping[str, float], *, is_method_chosen: b
             "way (--no-probe)"
         )
     if setup.impact_pulses:
-        (frequency, decay), tap = setup.pulse, setup.tap()
+        frequency, decay = setup.pulse
         err.print(
-            f"  a blow of the tool gives a pulse of {frequency:g} Hz that falls to 37 % in "
-            f"{format_si(decay, 's')}; {tap_words(tap)}"
+            f"  after a blow of the tool the device gets a pulse of force of {frequency:g} Hz, "
+            f"which falls to 37 % in {format_si(decay, 's')}; {tap_words(setup.tap())}"
         )
     _announce_damping(setup, named)
     _announce_own_rate(setup)

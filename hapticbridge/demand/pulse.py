@@ -10,40 +10,47 @@ from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.kernel.impact_pulse import largest_pulse
 from hapticbridge.kernel.jit import source_of
 from hapticbridge.kernel.parameters import LONGEST_DECAY, SHORTEST_DECAY, RunParameters
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.units import format_energy, format_si
 
 PULSES = {"steel": (300.0, 0.011), "wood": (100.0, 0.0125), "rubber": (30.0, 0.0167)}
 """Frequency in Hz and time constant in s of the pulse of a blow on a material. A tap on a real
 material shakes a stylus in a decaying sinusoid, and users rated other numbers than the measured
-ones as real (Okamura, Cutkosky & Dennerlein 2001). These are of the order that is known for
-aluminium, wood and rubber; no table of theirs was at hand to check them. Others feel like another
-material, and pulses of the same kind that were tuned by hand made taps on wood more real
-(Kuchenbecker, Fiene & Niemeyer 2006)."""
+ones as real (Okamura, Cutkosky & Dennerlein 2001). These are our choice, of the order that is known
+for aluminium, wood and rubber; no table of theirs was at hand to check them. Other numbers feel
+like another material."""
 
 USUAL_PULSE = "wood"
 """Pulse of a scene that names none."""
 
 
-def pulse_of(text: str, subject: str = "pulse") -> tuple[float, float]:
+def pulse_of(text: str, rate: float, source: str = "") -> tuple[float, float]:
     """Returns frequency in Hz and time constant in s of a name of ``PULSES`` or of ``HZ,MS``.
 
-    ``subject`` is what has the text, for a refusal.
+    Args:
+        text: The name or the two numbers.
+        rate: Ticks per second.
+        source: What has the text if no option does, for a refusal.
 
     Raises:
-        HapticBridgeError: It is neither, or out of range.
+        HapticBridgeError: It is neither, out of range, or too fast for the rate.
     """
-    if text in PULSES:
-        return PULSES[text]
+    most = 0.5 * rate
     try:
         frequency, decay = (float(part) for part in text.split(","))
     except ValueError:
         frequency = decay = math.nan
-    if not (0.0 <= frequency < math.inf and SHORTEST_DECAY <= 1e-3 * decay <= LONGEST_DECAY):
+    frequency, decay = PULSES.get(text, (frequency, 1e-3 * decay))
+    if not (0.0 <= frequency <= most and SHORTEST_DECAY <= decay <= LONGEST_DECAY):
+        of = f" of {frequency:g} Hz" if text in PULSES else ""
+        slow = [name for name, (own, _) in PULSES.items() if own <= most]
+        named = f"one of {choices(slow)}, or " if slow else ""
         raise HapticBridgeError(
-            f"{subject} is {shown(text)}; it must be one of {choices(PULSES)}, or HZ,MS such as "
-            f"250,8 with {1e3 * SHORTEST_DECAY:g} to {1e3 * LONGEST_DECAY:g} ms"
+            f"{source or 'pulse'} is {shown(text)}{of}; it must be {named}HZ,MS with at most "
+            f"{most:g} Hz, half the rate, and {1e3 * SHORTEST_DECAY:g} to "
+            f"{1e3 * LONGEST_DECAY:g} ms{source and '; --pulse replaces it'}"
         )
-    return frequency, 1e-3 * decay
+    return frequency, decay
 
 
 FORCE_FLOOR = 0.03
@@ -91,10 +98,36 @@ class Tap:
 def tap_words(tap: Tap | None) -> str:
     """Returns what a device can answer a tap with, as a clause; None strikes nothing."""
     if tap is None:
-        return "none is given: no geom that collides is rigid with the grip"
+        return "no blow pays for a pulse: no geom that collides is rigid with the grip"
     spare = f"{tap.spare:.2g} N s/m more damping than the coupling needs" if tap.spare else ""
     weak = "" if tap.pulse >= FORCE_FLOOR else ", too weak to be felt"
     return (
-        f"a tap at {tap.speed:g} m/s burns up to {format_energy(tap.burned)}, for a pulse of up to "
-        f"{format_si(tap.pulse, 'N')}{weak}; the device has {spare or 'no damping to spare'}"
+        f"a tap at {tap.speed:g} m/s takes up to {format_energy(tap.burned)} from the tool, which "
+        f"pays for a pulse of up to {format_si(tap.pulse, 'N')} on the hand{weak}; the device has "
+        f"{spare or 'no damping to spare'}"
     )
+
+
+_ENDS = {
+    TickFlag.STALE_SAMPLE: "a missing sample",
+    TickFlag.CONTROLLER_ACTIVE: "the passivity controller",
+    TickFlag.SWINGING: "the watch, because the device swung",
+    TickFlag.RUNS_AWAY: "the watch, because the device went the wrong way",
+    TickFlag.PROBED: "the watch, which tried the device",
+    TickFlag.RAMPING: "the guard, which held the force back",
+}
+"""Causes that end a pulse early, by the flag of ``ENDS``."""
+
+
+def end_words(ended_by: int) -> str:
+    """Returns the causes that ended pulses early, of their flags; empty without one."""
+    return ", ".join(words for flag, words in _ENDS.items() if ended_by & flag)
+
+
+def balance_words(paid: float, work: float, ended_by: int) -> str:
+    """Returns the energy in J at the hand of blows and pulses, and what ended pulses early."""
+    hand = f"the hand gave them {format_energy(-work)}"
+    if work >= 0.0:
+        hand = f"they gave the hand {format_energy(work)}"
+    ended = f"; cut short by {end_words(ended_by)}" if ended_by else ""
+    return f"the tool's blows gave them {format_energy(paid)}, {hand}{ended}"

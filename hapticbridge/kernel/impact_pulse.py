@@ -40,8 +40,9 @@ a sample is missing, R may exceed what was kept; the coupling's springs owe the 
 d is the stated delay, and a tick more of a real device, whose force is computed while the tick
 passes. Positions are those that were read: an encoder's steps Δ blur the bound by Δ/2 Σ ‖Δp‖.
 
-There is no pulse while a sample is missing, the passivity controller or the watch acts, or the
-lever is 0. Force and pulse together keep the force limit and the energy limit; the pulse yields.
+A missing sample, the passivity controller, the watch, or a lever of 0 ends a pulse; what it has
+not used is forgotten. Force and pulse together keep the force limit and the energy limit; the
+pulse yields.
 
 References:
     Okamura, Cutkosky & Dennerlein 2001, IEEE/ASME Trans. Mechatronics 6 (the decaying sinusoid);
@@ -57,6 +58,7 @@ import numpy as np
 from hapticbridge.kernel.codes import (
     CONTROLLER_ACTIVE,
     PROBED,
+    RAMPING,
     RUNS_AWAY,
     STALE_SAMPLE,
     SWINGING,
@@ -90,12 +92,14 @@ FORGOTTEN = 1e-12
 FADED = 0.01
 """Share of its first force below which a pulse ends; no unit."""
 
-_CAUTION = SWINGING | RUNS_AWAY | PROBED
+ENDS = STALE_SAMPLE | CONTROLLER_ACTIVE | SWINGING | RUNS_AWAY | PROBED
+"""Flags of a tick that end a pulse. A lever of 0, as of a held clutch, counts as ``RAMPING``."""
 
 IMPACT_DTYPE = np.dtype(
     [
         ("late_ticks", "<i8"),
         ("age", "<i8"),
+        ("ended_by", "<i8"),
         ("share", "<f8"),
         ("angle", "<f8"),
         ("rate", "<f8"),
@@ -119,12 +123,12 @@ IMPACT_DTYPE = np.dtype(
 )
 """Sub-record ``impact``, written by this module alone. ``share`` is σ, ``angle`` 2π f T in rad,
 ``rate`` T/τ, ``spare`` b_s in N s/m, ``speed`` v in m/s and ``late_ticks`` d. ``age`` is j, −1
-without a pulse. ``account`` is B in J, ``taken`` what the scene gave for it, of which it got q
-times as much, ``work`` Σ p·δp; ``held`` the largest pulse in N that the device may hold,
-``amplitude`` A in N, ``direction`` n in the device's frame, ``newest`` the pulse of this tick and
-``sent`` those of the last ticks in N. ``blow_energy`` is the W of all
-blows of the tick, ``normal`` the sum of their normals times W in the scene's frame; of the largest
-blow W, the speed −v_n in m/s, the coefficient of restitution that its contact asks for, and
+without a pulse; ``ended_by`` has the flags that ended one early. ``account`` is B in J, ``taken``
+what the scene gave for it, of which it got q times as much, ``work`` Σ p·δp; ``held`` the largest
+pulse in N that the device may hold, ``amplitude`` A in N, ``direction`` n in the device's frame,
+``newest`` the pulse of this tick and ``sent`` those of the last ticks in N. ``blow_energy`` is the
+W of all blows of the tick, ``normal`` the sum of their normals times W in the scene's frame; of the
+largest blow W, the speed −v_n in m/s, the coefficient of restitution that its contact asks for, and
 v⁺/(−v_n)."""
 
 
@@ -323,8 +327,11 @@ def add_pulse(s: State, force: Vector, torque: Vector) -> Vector:
     if impact.share == 0.0:
         return force
     sent = (0.0, 0.0, 0.0)
-    is_held = s.loop.external_flags & STALE_SAMPLE or s.guard.lever == 0.0
-    if is_held or s.observer.flags & CONTROLLER_ACTIVE or s.watch.flags & _CAUTION:
+    ends = (s.loop.external_flags | s.observer.flags | s.watch.flags) & ENDS
+    if s.guard.lever == 0.0:
+        ends |= RAMPING
+    if ends and impact.age >= 0:
+        impact.ended_by |= ends
         impact.age = -1
     if impact.age >= 0:
         power = max(_affordable(s), 0.0) / s.run.period

@@ -391,11 +391,6 @@ class RunParameters(StepTimes):
         ):
             if is_so:
                 raise no_pulses(self.impact_pulses, reason)
-        if self.pulse_frequency > 0.5 / self.period:
-            raise HapticBridgeError(
-                f"pulse is of {self.pulse_frequency:g} Hz; it must be at most half the rate, "
-                f"{0.5 / self.period:g}"
-            )
 
     @property
     def is_joint(self) -> bool:

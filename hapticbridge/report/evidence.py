@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,6 +18,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import Method, RunCoupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.kernel.codes import RAMPING
+from hapticbridge.kernel.impact_pulse import ENDS, FADED
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import due_times
 from hapticbridge.recording import Recording
@@ -215,6 +218,7 @@ class Blow:
         burned: Energy W in J that it took from the bodies.
         paid: Energy in J at the hand that it paid into the account of pulses.
         worked: Work Σ p·δp in J of the pulses until the next blow; negative if the hand did it.
+        ended_by: Flags of the tick that ended its pulse early (``impact_pulse.ENDS``); 0 if none.
     """
 
     time: float
@@ -225,6 +229,7 @@ class Blow:
     burned: float
     paid: float
     worked: float
+    ended_by: int
 
     @property
     def returned(self) -> float:
@@ -243,11 +248,14 @@ def blows_of(evidence: Evidence) -> list[Blow]:
     paid = ratio * np.diff(evidence.taken, prepend=0.0)
     moved = np.diff(ticks["device_position"], axis=0, append=ticks["device_position"][-1:])
     work = np.sum(ticks["pulse"] * moved, axis=1)
+    stops = (ticks["flags"] & ENDS) | np.where(ticks["lever"] == 0.0, RAMPING, 0)
+    life = math.ceil(-math.log(FADED) * parameters.pulse_decay / parameters.period) + 1
     ends = [group[0] + 1 for group in groups[1:]] + [len(ticks)]
     found = []
     for group, end in zip(groups, ends, strict=True):
         rows, last = ticks[group], ticks[group[-1]]
-        speed = float(rows["blow_speed"][0])
+        speed, given = float(rows["blow_speed"][0]), float(paid[group].sum())
+        after = stops[group[-1] + 1 : min(group[-1] + 1 + life, end)]
         found.append(
             Blow(
                 time=float(evidence.time[group[0]]),
@@ -256,8 +264,9 @@ def blows_of(evidence: Evidence) -> list[Blow]:
                 asked=float(rows["blow_restitution"].max()),
                 had=float(last["blow_rebound"] * last["blow_speed"]) / speed,
                 burned=float(rows["blow_energy"].sum()),
-                paid=float(paid[group].sum()),
+                paid=given,
                 worked=float(work[group[0] + 1 : end].sum()),
+                ended_by=int(after[np.argmax(after != 0)]) if given and after.size else 0,
             )
         )
     return found

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from hapticbridge.audit import AuditReport
 from hapticbridge.demand.guard import CONTROLLERS
 from hapticbridge.demand.own_loop import EVENT as OWN_LOOP_EVENT
+from hapticbridge.demand.pulse import end_words
 from hapticbridge.device import DATA_SHEET_UNITS
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import atomic_write, check_target, read_json, reason_of
 from hapticbridge.kernel.record import TickFlag, due_times
+from hapticbridge.kernel.restitution import BLOW_SPEED
 from hapticbridge.plotting import inline_svg
 from hapticbridge.recording import Recording
 from hapticbridge.recording.format import SHOWN_EVENT
@@ -231,7 +233,7 @@ def _controller_words(evidence: Evidence) -> str:
 
 
 def blow_row(blow: Blow) -> tuple[str, ...]:
-    """Returns time, speed, e, energies and work of a blow, in words."""
+    """Returns time, speed, e, energies and the end of the pulse of a blow, in words."""
     energies = (blow.burned, blow.returned, blow.paid, blow.worked)
     return (
         f"{blow.time:.3f} s",
@@ -239,6 +241,7 @@ def blow_row(blow: Blow) -> tuple[str, ...]:
         f"{blow.asked:.2f}",
         f"{blow.had:.2f}",
         *(format_energy(energy) for energy in energies),
+        end_words(blow.ended_by),
     )
 
 
@@ -478,6 +481,8 @@ def _evidence_parts(
         "balance": balance_of(report),
         "blows": [blow_row(each) for each in blows[:MAX_BLOWS]],
         "more_blows": max(len(blows) - MAX_BLOWS, 0),
+        "blow_speed": BLOW_SPEED,
+        "has_pulses": evidence.parameters.impact_pulses > 0.0,
         "moment": moment_of(evidence, report, in_process=in_process),
         "lateness": [float(np.percentile(lateness, p)) for p in (50, 99, 100)] if is_timed else [],
         "shares": [(name, percent(on)) for name, on in activities(evidence) if on.any()],

@@ -196,9 +196,9 @@ class BridgeOptions:
         impact_pulses: Share of the energy that a blow of the tool burns, 0 to 1, which may pay for
             a short pulse of force on the device: a tap then feels crisp. It needs rigid contact.
             Damping of the device beyond what the coupling needs makes it stronger.
-        pulse: Pulse of a blow: 'steel', 'wood' or 'rubber', or HZ,MS for its frequency in Hz and
-            the time in ms in which it falls to 37 %. 'scene', the default, takes the one that the
-            scene's custom text 'pulse' names, or 'wood'.
+        pulse: Pulse of a blow, with --impact-pulses: 'steel', 'wood' or 'rubber', or HZ,MS for its
+            frequency in Hz and the time in ms in which it falls to 37 %. 'scene', the default,
+            takes the one that the scene's custom text 'pulse' names, or 'wood'.
         realtime: Request real-time priority and locked memory for the loop, and print what the
             system refuses (see 'hapticbridge doctor'). By default requested for a real device.
         pipelined: Compute ahead, after the wrench was sent, what needs no new sample. The numbers
@@ -238,7 +238,12 @@ class BridgeOptions:
             self.rendering_method.refuse_slow()
         refuse_substeps(self.rendering_method.scheme, self.substeps or 1)
         if self.pulse != SCENE:
-            pulse_of(self.pulse)
+            if not self.impact_pulses:
+                raise HapticBridgeError(
+                    f"pulse is {shown(self.pulse)}, but impact-pulses is 0, so that no blow gives "
+                    "one; add --impact-pulses 1, or leave out --pulse"
+                )
+            pulse_of(self.pulse, self.loop_rate)
         if self.clutch is not None and self.clutch == self.dead_man:
             raise DeviceError(
                 f"clutch and dead-man are both button {self.clutch}; they exclude each other"
@@ -272,9 +277,10 @@ class BridgeOptions:
         """Returns the options with the pulse that the scene names, if blows give pulses."""
         if self.pulse != SCENE or not self.impact_pulses:
             return self
-        own = custom_text(model, "pulse") or USUAL_PULSE
-        pulse_of(own, "the scene's custom text 'pulse'")
-        return replace(self, pulse=own)
+        own = custom_text(model, "pulse")
+        source = "the scene's custom text 'pulse'" if own else "the usual pulse"
+        pulse_of(own or USUAL_PULSE, self.loop_rate, source)
+        return replace(self, pulse=own or USUAL_PULSE)
 
     @property
     def scene_ticks(self) -> int:
@@ -572,7 +578,9 @@ class RunSetup(StepTimes):
             and (info.is_real if options.probe is None else options.probe),
             tool_weight=options.tool_weight,
             impact_pulses=options.impact_pulses,
-            pulse=pulse_of(USUAL_PULSE if options.pulse == SCENE else options.pulse),
+            pulse=PULSES[USUAL_PULSE]
+            if options.pulse == SCENE
+            else pulse_of(options.pulse, options.loop_rate),
             is_realtime=wants_real_time(options.realtime, clock, is_real=info.is_real),
             is_pipelined=is_real_clock if options.pipelined is None else options.pipelined,
         )

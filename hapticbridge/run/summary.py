@@ -25,11 +25,12 @@ from hapticbridge.demand.loop_setting import fresh_share
 from hapticbridge.demand.methods import Method, RunCoupling, default_method, method_named
 from hapticbridge.demand.own_loop import OwnLoopAccount
 from hapticbridge.demand.probe import Direction, Probed
+from hapticbridge.demand.pulse import balance_words
 from hapticbridge.demand.timekeeping import RunTimes, Timekeeping
 from hapticbridge.demand.trip import Trip
 from hapticbridge.device import DeviceInfo
 from hapticbridge.kernel.codes import Grip, Scheme, coupling_ids, held_body
-from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy, work_words
+from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import TickFlag
@@ -259,7 +260,8 @@ class Summary:
         credit: Energy in J that another program's scene may give to the hand; 0 for another scene.
         grip: Name of the grip that the hand holds.
         device: Name of the device.
-        pulses: Energy in J that blows paid for pulses, and work in J of the pulses; None without.
+        pulses: Energy in J that blows paid for pulses, work in J of the pulses, and the flags that
+            ended any early; None without.
         trip: Stop by the guard; None without one.
         probe: Result of the probe of the device before the run, as a clause; empty without one.
         hands: Summary of each hand by itself, if several hold the scene. Fault, share of the slack
@@ -294,7 +296,7 @@ class Summary:
     credit: float = 0.0
     grip: str = ""
     device: str = ""
-    pulses: tuple[float, float] | None = None
+    pulses: tuple[float, float, int] | None = None
     trip: Trip | None = None
     probe: str = ""
     hands: tuple[Summary, ...] = ()
@@ -449,8 +451,7 @@ class Summary:
             peak = f"{format_si(self.peak_force, 'N')} on the fingers"
         yield "peak", peak + reached
         if self.pulses is not None:
-            paid, worked = self.pulses
-            yield "pulses", f"paid {format_energy(paid)} by blows; they {work_words(worked)}"
+            yield "pulses", balance_words(*self.pulses)
         if self.reach is not None:
             yield "reach", f"{format_si(self.reach, 'm')}; beyond, no handle and no force"
         yield from self._energy_rows()
@@ -594,6 +595,7 @@ class Summary:
             pulses=(
                 parameters.force_scale / parameters.scale * float(state["impact"]["taken"][0]),
                 float(state["impact"]["work"][0]),
+                int(state["impact"]["ended_by"][0]),
             )
             if parameters.impact_pulses
             else None,

@@ -44,6 +44,9 @@ class Bounce(NamedTuple):
     names: str
     e: float
 
+    def __str__(self) -> str:
+        return f"{self.names}, e at most {self.e:.2g}"
+
 
 def announce_rigid(model: mujoco.MjModel, options: Mapping[str, Any]) -> tuple[SceneChange, ...]:
     """Returns what rigid contacts and constraints change, each as ``name: old → new``.

@@ -9,7 +9,7 @@ from typing import Any
 from hapticbridge.arguments import rule_of, shown, types_of, value_from
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import Limits
-from hapticbridge.demand.methods import Method, method_named
+from hapticbridge.demand.methods import SCENE, Method, method_named
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.kernel.codes import Grip
 from hapticbridge.run.options import BridgeOptions, RunSetup, Workspace
@@ -154,6 +154,8 @@ class Settings:
             new.setdefault("scene_rate", new.get("rate", options.loop_rate))
         if method.has_coupling:
             new.setdefault("contact_stiffness", None)
+        if new.get("impact_pulses") == 0.0:
+            new.setdefault("pulse", SCENE)
         new["workspace"] = replace(workspace, **own[Workspace])
         new["limits"] = replace(options.limits, **own[Limits])
         scene = {
