@@ -24,6 +24,7 @@ from hapticbridge.audit import audit
 from hapticbridge.errors import SceneError
 from hapticbridge.run.description import model_digest
 from hapticbridge.scene import load_scene
+from hapticbridge.scene.load import plain_model, read_scene
 from hapticbridge.scene.source import read_elements
 
 MESHED = """<body name="tool"><freejoint/><geom type="mesh" mesh="m" mass=".1"/>
@@ -435,6 +436,53 @@ def test_a_part_that_loses_nothing_is_not_told(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load_scene(tmp_path / "scene.xml", grip="tool")
+
+
+# What MuJoCo loses as it copies
+
+DANGLING = {
+    "<actuator><motor joint='none'/></actuator>": "unknown transmission target 'none'",
+    "<equality><weld body1='none'/></equality>": "unknown element 'none' in equality constraint",
+    "<contact><exclude body1='tool' body2='none'/></contact>": "body 'none' not found in bodypair",
+    "<contact><pair geom1='tip' geom2='none'/></contact>": "geom 'none' not found in collision",
+    "<sensor><jointpos joint='none'/></sensor>": "unrecognized name 'none' of sensorized object",
+    "<tendon><fixed name='t'><joint joint='none' coef='1'/></fixed></tendon>": "joint 'none' not",
+    "<custom><tuple name='u'><element objtype='body' objname='none'/></tuple></custom>": "'none'",
+}
+TIPPED = "<body name='tool'><freejoint/><geom name='tip' size='.02'/><site name='grip'/></body>"
+
+
+@pytest.mark.parametrize("section", DANGLING)
+def test_an_element_that_names_what_the_scene_lacks_is_refused_and_not_dropped(
+    section: str, tmp_path: Path
+) -> None:
+    path = scene_file(tmp_path, mjcf(section, body=TIPPED))
+    for source in (path, mujoco.MjSpec.from_file(str(path))):
+        with pytest.raises(SceneError, match=f"^cannot compile scene .*{DANGLING[section]}"):
+            load_scene(source)
+    with pytest.raises(SceneError, match=DANGLING[section]):
+        plain_model(read_scene(path))
+    path.write_text(path.read_text().replace("none", "other"))
+    others = "<body name='other'><joint name='other'/><geom name='other' size='.1'/></body>"
+    path.write_text(path.read_text().replace("</worldbody>", others + "</worldbody>"))
+    assert load_scene(path).model.nbody > 2
+
+
+def test_a_part_with_a_keyframe_that_is_attached_twice_is_refused(tmp_path: Path) -> None:
+    """The command is a process of its own: a null copy would end this one."""
+    arm = "<body name='arm'><joint axis='0 0 1'/><geom size='.02' pos='.1 0 0'/></body>"
+    base = "<body name='base'><freejoint/><geom size='.1'/>{}</body>"
+    held = base.format("<attach model='a' body='arm' prefix='a/'/>")
+    both = "".join(f"<attach model='b' body='base' prefix='{n}/'/>" for n in (1, 2))
+    part = "<asset><model name='{0}' file='{0}.xml'/></asset>"
+    keyed = mjcf("<keyframe><key name='home' qpos='0'/></keyframe>", body=arm)
+    scene_file(tmp_path, keyed, "a.xml")
+    scene_file(tmp_path, mjcf(part.format("a"), body=held), "b.xml")
+    path = scene_file(tmp_path, mjcf(part.format("b"), body=both))
+    command = [sys.executable, "-m", "hapticbridge", "check", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].endswith("repeated name 'a/home' in key")
 
 
 # Bounds on what a scene may name and take

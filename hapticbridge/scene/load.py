@@ -18,7 +18,7 @@ import mujoco
 
 from hapticbridge.arguments import shown
 from hapticbridge.errors import SceneError, SceneWarning, choices, nearest
-from hapticbridge.kernel.mujoco_c import quiet, warnings_of_reading
+from hapticbridge.kernel.mujoco_c import copy_of, quiet, warnings_of_reading
 from hapticbridge.scene.checks import (
     MAY_BE_ACTIVE,
     check_finite,
@@ -255,7 +255,8 @@ def spec_source(spec: mujoco.MjSpec) -> SceneSource:
             an incompatible option.
     """
     path = Path(spec.modelfiledir) / f"{spec.modelname or 'scene'}.xml"
-    spec = spec.copy()
+    with _refused(path):
+        spec = copy_of(spec)
     with suppress(ValueError, mujoco.FatalError):  # the compilation of the scene gives the reason
         for body in spec.bodies[1:]:
             if body.explicitinertial or (body.mass > 0.0 and not body.geoms):
@@ -311,7 +312,8 @@ def plain_model(source: SceneSource) -> mujoco.MjModel:
 
     An integrator that MuJoCo refuses for this scene is replaced, as the bridge does.
     """
-    spec = source.spec.copy()
+    with _refused(source.path):
+        spec = copy_of(source.spec)
     _limit_memory(spec)
     with suppress(ValueError):
         return _compiled(spec)[0]
@@ -385,7 +387,9 @@ def compile_scene(
     Warns:
         UserWarning: The run deviates from the file in a detail.
     """
-    path, spec = source.path, source.spec.copy()
+    path = source.path
+    with _refused(path):
+        spec = copy_of(source.spec)
     if grip is None:
         grip = own_grips(source) or "grip"
     grips = (grip,) if isinstance(grip, str) else tuple(grip)
