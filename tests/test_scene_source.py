@@ -412,6 +412,69 @@ def test_a_run_of_a_specification_is_simulated_again_bit_for_bit(tmp_path: Path)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
 
 
+@pytest.mark.parametrize(
+    ("folder", "file", "held"),
+    [
+        ("sub", "part.obj", "part.obj"),
+        ("sub", "part.obj", "sub/part.obj"),
+        ("sub", "inner/part.obj", "inner/part.obj"),
+        ("", "inner/part.obj", "PART.obj"),
+        ("../up", "part.obj", "part.obj"),
+        ("/anywhere", "part.obj", "part.obj"),
+        ("", "../part.obj", "../part.obj"),
+        ("", "/anywhere/part.obj", "/anywhere/part.obj"),
+    ],
+)
+def test_an_asset_in_memory_is_recorded_where_its_element_names_it(
+    folder: str, file: str, held: str, tmp_path: Path
+) -> None:
+    spec = mujoco.MjSpec.from_string(
+        mjcf(f"<compiler meshdir='{folder}'/>", MESH.format(file), body=MESHED),
+        assets={held: obj_bytes(), "spare.obj": b""},
+    )
+    path = tmp_path / "run.mcap"
+    recorded(path, scene := load_scene(spec), duration=0.02)
+    assert audit(path).resimulation == "bit for bit"
+    assert len(scene.sources) == 2
+
+
+@pytest.mark.parametrize("held", ["part.obj", "sub/part.obj", "elsewhere/part.obj"])
+@pytest.mark.parametrize("folder", ["", "sub"])
+def test_an_asset_in_memory_comes_before_a_file(folder: str, held: str, tmp_path: Path) -> None:
+    scene_file(tmp_path, obj_bytes(0.02), f"{folder or '.'}/part.obj")
+    text = mjcf(f"<compiler meshdir='{folder}'/>", MESH.format("part.obj"), body=MESHED)
+    with contextlib.chdir(tmp_path):
+        spec = mujoco.MjSpec.from_string(text, assets={held: obj_bytes(0.01)})
+        ours, own = load_scene(spec).model, spec.copy().compile()
+    assert ours.mesh_pos[0] == pytest.approx(own.mesh_pos[0], rel=1e-5)
+    assert own.mesh_pos[0] == pytest.approx(0.01 / 4.0, rel=1e-5)
+
+
+def test_assets_whose_names_end_alike_are_told_apart_or_refused() -> None:
+    part = "<mesh name='{0}' file='{0}/part.obj'/>"
+    geoms = "".join(f"<geom type='mesh' mesh='{name}' mass='1'/>" for name in ("a", "b"))
+    body = f"<body name='tool'><freejoint/>{geoms}<site name='grip'/></body>"
+    text = mjcf(f"<asset>{part.format('a')}{part.format('b')}</asset>", body=body)
+    assets = {"a/part.obj": obj_bytes(), "b/part.obj": obj_bytes(0.02)}
+    model = load_scene(mujoco.MjSpec.from_string(text, assets=assets)).model
+    assert model.mesh_pos[1] == pytest.approx(2.0 * model.mesh_pos[0])
+    outer = {f"/{name}": data for name, data in assets.items()}
+    spec = mujoco.MjSpec.from_string(text.replace("file='", "file='/"), assets=outer)
+    with pytest.raises(SceneError, match=r"Error opening file 'part\.obj'"):
+        load_scene(spec)
+
+
+@pytest.mark.parametrize("name", ["a\\b", "x" * 300, "部" * 100])
+def test_a_name_that_no_file_can_have_does_not_keep_a_run_from_its_audit(
+    name: str, tmp_path: Path
+) -> None:
+    spec = built_spec()
+    spec.modelname = name
+    path = tmp_path / "run.mcap"
+    recorded(path, load_scene(spec), duration=0.02)
+    assert audit(path).resimulation == "bit for bit"
+
+
 # Warnings of MuJoCo as it reads
 
 LIGHT = """<mujoco><option gravity="0 0 -1.62"/><worldbody><body name="b"><geom size=".1"/></body>

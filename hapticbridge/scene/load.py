@@ -51,7 +51,7 @@ from hapticbridge.scene.handle import (
 )
 from hapticbridge.scene.parameters import apply_parameters
 from hapticbridge.scene.scene import Scene
-from hapticbridge.scene.source import SourceFile, collect_sources
+from hapticbridge.scene.source import SourceFile, collect_sources, with_assets
 from hapticbridge.scene.start import start_on_constraints
 from hapticbridge.scene.treatment import SceneChange
 from hapticbridge.units import format_si
@@ -254,7 +254,9 @@ def spec_source(spec: mujoco.MjSpec) -> SceneSource:
         SceneError: MuJoCo cannot write the specification, a number of it is not finite, or it has
             an incompatible option.
     """
-    path = Path(spec.modelfiledir) / f"{spec.modelname or 'scene'}.xml"
+    # MuJoCo opens no file with a backslash in its name, and systems none of over 255 bytes
+    name = spec.modelname.replace("\\", "_").encode()[-200:].decode(errors="ignore")
+    path = Path(spec.modelfiledir) / f"{name or 'scene'}.xml"
     with _refused(path):
         spec = copy_of(spec)
     with suppress(ValueError, mujoco.FatalError):  # the compilation of the scene gives the reason
@@ -266,11 +268,10 @@ def spec_source(spec: mujoco.MjSpec) -> SceneSource:
         _name_folders(spec, model)
     with _refused(path):
         sources = collect_sources(path, spec.to_xml().encode())
-    known = {source.name for source in sources}
     held = {
         name: data.encode() if isinstance(data, str) else data for name, data in spec.assets.items()
     }
-    sources += tuple(SourceFile(name, held[name]) for name in sorted(held.keys() - known))
+    sources = with_assets(sources, held)
     check_numbers(sources)
     check_options(spec)
     return SceneSource(path, spec, sources, {})
