@@ -270,6 +270,9 @@ def free(geom: str, grip: str = "") -> str:
 SAG = free('size="0.01" mass="{}"', 'pos="0.005 0 0"')
 LINKS = """<body name="link"><joint/><geom size="0.01" mass="0.001"/><body pos="0.1 0 0">
   <joint/><geom size="0.02" mass="{}"/><site name="grip"/></body></body>"""
+ON_A_BASE = """<body name="base"><joint type="slide" damping="1e9"/>
+  <geom type="box" size=".1 .1 .1" mass="{base}"/><body pos="0 0 .5"><joint axis="0 0 1"/>
+  <geom pos=".3 0 0" size=".05" mass="{arm}"/><site name="grip" pos=".3 0 0"/></body></body>"""
 HEAVY = GOOD_OPTION.replace('"0 0 0"', '"0 0 -9.81"')
 
 
@@ -283,6 +286,8 @@ HEAVY = GOOD_OPTION.replace('"0 0 0"', '"0 0 -9.81"')
         ("units", GOOD_OPTION, free('size="1.0" mass="40"'), None),
         ("units", GOOD_OPTION, free('size="1.6" mass="40"'), f"{length(3.2)} long"),
         ("units", GOOD_OPTION, free('size="1.0" mass="60"'), f"weighs {weight(60)}"),
+        ("units", GOOD_OPTION, ON_A_BASE.format(base=80, arm=40), None),
+        ("units", GOOD_OPTION, ON_A_BASE.format(base=40, arm=60), f"weighs {weight(60)}"),
     ],
 )
 def test_a_tool_beyond_the_line_is_told_and_none_below(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import mujoco
 import pytest
 
 import hapticbridge as hb
-from hapticbridge.kernel.mujoco_c import without_timers
+from hapticbridge.kernel.mujoco_c import copy_of, without_timers
 
 STEP = int(mujoco.mjtTimer.mjTIMER_STEP)
 
@@ -75,3 +78,22 @@ def test_a_run_reads_no_clock_in_a_step() -> None:
         before = scene.data.timer[STEP].duration
         bridge.run(0.05)
         assert scene.data.timer[STEP].duration == before
+
+
+def test_a_copy_is_whole_or_refused() -> None:
+    lists = ("actuators", "equalities", "excludes", "pairs", "sensors", "tendons", "tuples")
+
+    def stand_in(copied: dict[str, Any], *, refused: str = "") -> Any:
+        def compiled() -> None:
+            if refused:
+                raise ValueError(refused)
+
+        copy = SimpleNamespace(_address=1, **dict.fromkeys(lists, (0,)) | copied)
+        return SimpleNamespace(copy=lambda: copy, compile=compiled, **dict.fromkeys(lists, (0,)))
+
+    assert copy_of(whole := stand_in({})) is whole.copy()
+    for lost in ({"sensors": ()}, {"tuples": ()}):
+        with pytest.raises(ValueError, match="no such joint"):
+            copy_of(stand_in(lost, refused="no such joint"))
+        with pytest.raises(ValueError, match="MuJoCo cannot copy the specification"):
+            copy_of(stand_in(lost))

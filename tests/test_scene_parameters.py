@@ -249,6 +249,69 @@ def test_unfit_parameters_are_refused(tmp_path: Path, text: str, words: str) -> 
     assert refusal(path, gap=0.02)
 
 
+OVERRIDDEN = """<mujoco>
+  <asset><mesh name="part" vertex="0 0 0 .02 0 0 0 .02 0 0 0 .02"/></asset>
+  <worldbody>
+    <geom name="rod" type="capsule" fromto=".1 0 .1 .2 0 .1" size="0.01"/>
+    <geom name="tilted" type="box" size=".1 .1 .01" euler="0 20 0"/>
+    <geom name="turned" type="box" size=".1 .1 .01" pos="1 0 0" quat="0.02 0 0 0"/>
+    <body name="tool"><freejoint/><inertial pos="0 0 0" mass="0.3" diaginertia="1 1 1"/>
+      <geom name="tool" size=".02" mass="0.02"/><site name="grip"/></body>
+    <body name="lid"><joint name="hinge" damping="0.02" springdamper="0.1 1"/>
+      <geom name="lid" type="mesh" mesh="part"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "field", "now"),
+    [
+        ("geom", "tool", "mass", 0.02),
+        ("body", "lid", "mass", 0.0),
+        ("geom", "rod", "size[1]", 0.0),
+        ("geom", "lid", "size[0]", 0.0),
+        ("geom", "tilted", "quat[2]", 0.0),
+        ("joint", "hinge", "damping[0]", 0.02),
+    ],
+)
+def test_a_number_that_something_else_determines_is_refused_when_it_is_set(
+    tmp_path: Path, kind: str, name: str, field: str, now: float
+) -> None:
+    scene = tmp_path / "scene.xml"
+    scene.write_text(OVERRIDDEN)
+    bare, _, index = field.rstrip("]").partition("[")
+    at = f", index = {index}" if index else ""
+    sets = f'{{ kind = "{kind}", name = "{name}", field = "{bare}"{at}, offset = {now - 0.02} }}'
+    rod = '{ kind = "geom", name = "rod", field = "size", index = 0, offset = -0.01 }'
+    (tmp_path / "scene.toml").write_text(table(f"{sets}, {rod}"))
+    words = (
+        f"parameter 'gap' sets {field} of {kind} '{name}' to {now + 0.03:g}, which changes nothing"
+    )
+    with pytest.raises(hb.HapticBridgeError) as refused:
+        load_scene(scene, gap=0.05)
+    assert str(refused.value).startswith(words)
+    assert load_scene(scene, gap=0.02).parameters == {"gap": 0.02}
+
+
+def test_numbers_that_change_something_only_together_are_set(tmp_path: Path) -> None:
+    """A quaternion is normalized: a new w alone, with x = 0, would change nothing."""
+    scene = tmp_path / "scene.xml"
+    scene.write_text(OVERRIDDEN)
+    turned = '{{ kind = "geom", name = "turned", field = "quat", index = {}, offset = {} }}'
+    (tmp_path / "scene.toml").write_text(table(f"{turned.format(0, 0)}, {turned.format(1, -0.02)}"))
+    quat = load_scene(scene, gap=0.05).model.geom("turned").quat
+    assert quat == pytest.approx(np.array([0.05, 0.03, 0.0, 0.0]) / math.hypot(0.05, 0.03))
+
+
+def test_a_number_that_mujoco_refuses_is_told_by_mujoco(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.xml"
+    scene.write_text(OVERRIDDEN)
+    sets = '{ kind = "geom", name = "rod", field = "pos", index = 0, offset = -0.02 }'
+    (tmp_path / "scene.toml").write_text(table(sets))
+    with pytest.raises(hb.HapticBridgeError, match="both pos and fromto defined in geom"):
+        load_scene(scene, gap=0.05)
+
+
 def test_a_toml_file_of_somebody_else_is_passed_over(tmp_path: Path) -> None:
     path = scene_with(tmp_path, '[tool.poetry]\nname = "bench"')
     assert load_scene(path).parameters == {}

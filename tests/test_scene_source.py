@@ -24,6 +24,7 @@ from hapticbridge.audit import audit
 from hapticbridge.errors import SceneError
 from hapticbridge.run.description import model_digest
 from hapticbridge.scene import load_scene
+from hapticbridge.scene.load import plain_model, read_scene
 from hapticbridge.scene.source import read_elements
 
 MESHED = """<body name="tool"><freejoint/><geom type="mesh" mesh="m" mass=".1"/>
@@ -411,6 +412,69 @@ def test_a_run_of_a_specification_is_simulated_again_bit_for_bit(tmp_path: Path)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
 
 
+@pytest.mark.parametrize(
+    ("folder", "file", "held"),
+    [
+        ("sub", "part.obj", "part.obj"),
+        ("sub", "part.obj", "sub/part.obj"),
+        ("sub", "inner/part.obj", "inner/part.obj"),
+        ("", "inner/part.obj", "PART.obj"),
+        ("../up", "part.obj", "part.obj"),
+        ("/anywhere", "part.obj", "part.obj"),
+        ("", "../part.obj", "../part.obj"),
+        ("", "/anywhere/part.obj", "/anywhere/part.obj"),
+    ],
+)
+def test_an_asset_in_memory_is_recorded_where_its_element_names_it(
+    folder: str, file: str, held: str, tmp_path: Path
+) -> None:
+    spec = mujoco.MjSpec.from_string(
+        mjcf(f"<compiler meshdir='{folder}'/>", MESH.format(file), body=MESHED),
+        assets={held: obj_bytes(), "spare.obj": b""},
+    )
+    path = tmp_path / "run.mcap"
+    recorded(path, scene := load_scene(spec), duration=0.02)
+    assert audit(path).resimulation == "bit for bit"
+    assert len(scene.sources) == 2
+
+
+@pytest.mark.parametrize("held", ["part.obj", "sub/part.obj", "elsewhere/part.obj"])
+@pytest.mark.parametrize("folder", ["", "sub"])
+def test_an_asset_in_memory_comes_before_a_file(folder: str, held: str, tmp_path: Path) -> None:
+    scene_file(tmp_path, obj_bytes(0.02), f"{folder or '.'}/part.obj")
+    text = mjcf(f"<compiler meshdir='{folder}'/>", MESH.format("part.obj"), body=MESHED)
+    with contextlib.chdir(tmp_path):
+        spec = mujoco.MjSpec.from_string(text, assets={held: obj_bytes(0.01)})
+        ours, own = load_scene(spec).model, spec.copy().compile()
+    assert ours.mesh_pos[0] == pytest.approx(own.mesh_pos[0], rel=1e-5)
+    assert own.mesh_pos[0] == pytest.approx(0.01 / 4.0, rel=1e-5)
+
+
+def test_assets_whose_names_end_alike_are_told_apart_or_refused() -> None:
+    part = "<mesh name='{0}' file='{0}/part.obj'/>"
+    geoms = "".join(f"<geom type='mesh' mesh='{name}' mass='1'/>" for name in ("a", "b"))
+    body = f"<body name='tool'><freejoint/>{geoms}<site name='grip'/></body>"
+    text = mjcf(f"<asset>{part.format('a')}{part.format('b')}</asset>", body=body)
+    assets = {"a/part.obj": obj_bytes(), "b/part.obj": obj_bytes(0.02)}
+    model = load_scene(mujoco.MjSpec.from_string(text, assets=assets)).model
+    assert model.mesh_pos[1] == pytest.approx(2.0 * model.mesh_pos[0])
+    outer = {f"/{name}": data for name, data in assets.items()}
+    spec = mujoco.MjSpec.from_string(text.replace("file='", "file='/"), assets=outer)
+    with pytest.raises(SceneError, match=r"Error opening file 'part\.obj'"):
+        load_scene(spec)
+
+
+@pytest.mark.parametrize("name", ["a\\b", "x" * 300, "部" * 100])
+def test_a_name_that_no_file_can_have_does_not_keep_a_run_from_its_audit(
+    name: str, tmp_path: Path
+) -> None:
+    spec = built_spec()
+    spec.modelname = name
+    path = tmp_path / "run.mcap"
+    recorded(path, load_scene(spec), duration=0.02)
+    assert audit(path).resimulation == "bit for bit"
+
+
 # Warnings of MuJoCo as it reads
 
 LIGHT = """<mujoco><option gravity="0 0 -1.62"/><worldbody><body name="b"><geom size=".1"/></body>
@@ -435,6 +499,53 @@ def test_a_part_that_loses_nothing_is_not_told(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load_scene(tmp_path / "scene.xml", grip="tool")
+
+
+# What MuJoCo loses as it copies
+
+DANGLING = {
+    "<actuator><motor joint='none'/></actuator>": "unknown transmission target 'none'",
+    "<equality><weld body1='none'/></equality>": "unknown element 'none' in equality constraint",
+    "<contact><exclude body1='tool' body2='none'/></contact>": "body 'none' not found in bodypair",
+    "<contact><pair geom1='tip' geom2='none'/></contact>": "geom 'none' not found in collision",
+    "<sensor><jointpos joint='none'/></sensor>": "unrecognized name 'none' of sensorized object",
+    "<tendon><fixed name='t'><joint joint='none' coef='1'/></fixed></tendon>": "joint 'none' not",
+    "<custom><tuple name='u'><element objtype='body' objname='none'/></tuple></custom>": "'none'",
+}
+TIPPED = "<body name='tool'><freejoint/><geom name='tip' size='.02'/><site name='grip'/></body>"
+
+
+@pytest.mark.parametrize("section", DANGLING)
+def test_an_element_that_names_what_the_scene_lacks_is_refused_and_not_dropped(
+    section: str, tmp_path: Path
+) -> None:
+    path = scene_file(tmp_path, mjcf(section, body=TIPPED))
+    for source in (path, mujoco.MjSpec.from_file(str(path))):
+        with pytest.raises(SceneError, match=f"^cannot compile scene .*{DANGLING[section]}"):
+            load_scene(source)
+    with pytest.raises(SceneError, match=DANGLING[section]):
+        plain_model(read_scene(path))
+    path.write_text(path.read_text().replace("none", "other"))
+    others = "<body name='other'><joint name='other'/><geom name='other' size='.1'/></body>"
+    path.write_text(path.read_text().replace("</worldbody>", others + "</worldbody>"))
+    assert load_scene(path).model.nbody > 2
+
+
+def test_a_part_with_a_keyframe_that_is_attached_twice_is_refused(tmp_path: Path) -> None:
+    """The command is a process of its own: a null copy would end this one."""
+    arm = "<body name='arm'><joint axis='0 0 1'/><geom size='.02' pos='.1 0 0'/></body>"
+    base = "<body name='base'><freejoint/><geom size='.1'/>{}</body>"
+    held = base.format("<attach model='a' body='arm' prefix='a/'/>")
+    both = "".join(f"<attach model='b' body='base' prefix='{n}/'/>" for n in (1, 2))
+    part = "<asset><model name='{0}' file='{0}.xml'/></asset>"
+    keyed = mjcf("<keyframe><key name='home' qpos='0'/></keyframe>", body=arm)
+    scene_file(tmp_path, keyed, "a.xml")
+    scene_file(tmp_path, mjcf(part.format("a"), body=held), "b.xml")
+    path = scene_file(tmp_path, mjcf(part.format("b"), body=both))
+    command = [sys.executable, "-m", "hapticbridge", "check", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].endswith("repeated name 'a/home' in key")
 
 
 # Bounds on what a scene may name and take

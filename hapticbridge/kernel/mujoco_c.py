@@ -238,6 +238,25 @@ def warnings_of_reading(spec: mujoco.MjSpec) -> list[str]:
     return [text(address, k).decode() for k in range(library.mjs_numWarnings(address))]
 
 
+def copy_of(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Returns a whole copy of a specification.
+
+    MuJoCo's own copy lacks what refers to nothing, such as an actuator of no joint. It is a null
+    pointer, whose first use ends the process, where two keyframes have one name.
+
+    Raises:
+        ValueError: MuJoCo cannot copy the specification, and what it refuses in it.
+    """
+    copy = spec.copy()
+    if copy._address and all(len(getattr(copy, of)) == len(getattr(spec, of)) for of in _REFERRING):
+        return copy
+    spec.compile()  # raises the reason
+    raise ValueError("MuJoCo cannot copy the specification")
+
+
+_REFERRING = "actuators", "equalities", "excludes", "pairs", "sensors", "tendons", "tuples"
+
+
 _SCALARS: dict[str, Any] = {
     "int": ctypes.c_int,
     "mjtNum": ctypes.c_double,

@@ -14,7 +14,7 @@ from hapticbridge.scene.checks import OF_A_JOINT, driven_name, pumps
 from hapticbridge.scene.contacts import REFERENCE_STEPS, impedance_at
 from hapticbridge.scene.fault import CompiledScene, Fault, length, number, numbers, weight
 from hapticbridge.scene.load import SceneSource
-from hapticbridge.scene.physics import joint_inertia
+from hapticbridge.scene.physics import joint_inertia, tool_masses
 from hapticbridge.scene.scene import Scene
 from hapticbridge.scene.source_map import Places
 
@@ -130,8 +130,8 @@ UNITS = "units"
 
 
 MAX_TOOL, HEAVIEST_TOOL = 3.0, 50.0
-"""Length in m and mass in kg above which no hand holds a tool, so that wrong units are
-suspected."""
+"""Length of a tool in m, and mass in kg of its part that the hand holds, above which wrong units
+are suspected: no hand holds that. A robot's arm may hang on a base that weighs more."""
 
 
 NARROWEST_RANGE = np.radians(np.pi)
@@ -148,7 +148,7 @@ def unit_faults(case: CompiledScene) -> Iterator[Fault]:
     """Yields a tool that no hand could hold: its units are probably wrong."""
     model = case.model
     tool_bodies = case.tool_bodies
-    mass, extent = float(model.body_mass[tool_bodies].sum()), float(tool_extent(case).max())
+    mass, extent = tool_masses(model, case.scene.grip)[0], float(tool_extent(case).max())
     found = []
     if extent > MAX_TOOL:
         found.append(f"is {length(extent)} long")

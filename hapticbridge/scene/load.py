@@ -18,7 +18,7 @@ import mujoco
 
 from hapticbridge.arguments import shown
 from hapticbridge.errors import SceneError, SceneWarning, choices, nearest
-from hapticbridge.kernel.mujoco_c import quiet, warnings_of_reading
+from hapticbridge.kernel.mujoco_c import copy_of, quiet, warnings_of_reading
 from hapticbridge.scene.checks import (
     MAY_BE_ACTIVE,
     check_finite,
@@ -51,7 +51,7 @@ from hapticbridge.scene.handle import (
 )
 from hapticbridge.scene.parameters import apply_parameters
 from hapticbridge.scene.scene import Scene
-from hapticbridge.scene.source import SourceFile, collect_sources
+from hapticbridge.scene.source import SourceFile, collect_sources, with_assets
 from hapticbridge.scene.start import start_on_constraints
 from hapticbridge.scene.treatment import SceneChange
 from hapticbridge.units import format_si
@@ -254,8 +254,11 @@ def spec_source(spec: mujoco.MjSpec) -> SceneSource:
         SceneError: MuJoCo cannot write the specification, a number of it is not finite, or it has
             an incompatible option.
     """
-    path = Path(spec.modelfiledir) / f"{spec.modelname or 'scene'}.xml"
-    spec = spec.copy()
+    # MuJoCo opens no file with a backslash in its name, and systems none of over 255 bytes
+    name = spec.modelname.replace("\\", "_").encode()[-200:].decode(errors="ignore")
+    path = Path(spec.modelfiledir) / f"{name or 'scene'}.xml"
+    with _refused(path):
+        spec = copy_of(spec)
     with suppress(ValueError, mujoco.FatalError):  # the compilation of the scene gives the reason
         for body in spec.bodies[1:]:
             if body.explicitinertial or (body.mass > 0.0 and not body.geoms):
@@ -265,11 +268,10 @@ def spec_source(spec: mujoco.MjSpec) -> SceneSource:
         _name_folders(spec, model)
     with _refused(path):
         sources = collect_sources(path, spec.to_xml().encode())
-    known = {source.name for source in sources}
     held = {
         name: data.encode() if isinstance(data, str) else data for name, data in spec.assets.items()
     }
-    sources += tuple(SourceFile(name, held[name]) for name in sorted(held.keys() - known))
+    sources = with_assets(sources, held)
     check_numbers(sources)
     check_options(spec)
     return SceneSource(path, spec, sources, {})
@@ -311,7 +313,8 @@ def plain_model(source: SceneSource) -> mujoco.MjModel:
 
     An integrator that MuJoCo refuses for this scene is replaced, as the bridge does.
     """
-    spec = source.spec.copy()
+    with _refused(source.path):
+        spec = copy_of(source.spec)
     _limit_memory(spec)
     with suppress(ValueError):
         return _compiled(spec)[0]
@@ -385,7 +388,9 @@ def compile_scene(
     Warns:
         UserWarning: The run deviates from the file in a detail.
     """
-    path, spec = source.path, source.spec.copy()
+    path = source.path
+    with _refused(path):
+        spec = copy_of(source.spec)
     if grip is None:
         grip = own_grips(source) or "grip"
     grips = (grip,) if isinstance(grip, str) else tuple(grip)

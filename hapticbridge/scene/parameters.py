@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from numbers import Real
@@ -15,6 +16,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.errors import SceneError, choices
+from hapticbridge.kernel.mujoco_c import copy_of
 
 # Parameter file of a scene
 
@@ -224,7 +226,36 @@ def apply_parameters(
                 places.setdefault(key, _Place(element, setting)).add(parameter, setting)
     for place in places.values():
         place.set(effective, values)
+    _check_effects(spec, places.values())
     return effective
+
+
+def _check_effects(spec: mujoco.MjSpec, places: Iterable[_Place]) -> None:
+    """Refuses a number that was set and, beside all others, changes nothing when compiled."""
+    changed = [(place, place.was) for place in places if place.was is not None]
+    whole = _compiled(spec) if changed else None
+    for place, was in changed:
+        result, place.number = place.number, was
+        other, place.number = _compiled(spec), result
+        if whole is not None and other == whole:
+            raise SceneError(
+                f"{place.subject} to {result:g}, which changes nothing: the scene's file "
+                "determines it otherwise, as <inertial> does the mass of geoms, fromto a length, "
+                "a mesh its size and euler a quat"
+            )
+
+
+def _compiled(spec: mujoco.MjSpec) -> bytes | None:
+    """Returns the compiled scene; None if MuJoCo refuses it, which its loading tells."""
+    with suppress(ValueError, mujoco.FatalError):
+        copy = copy_of(spec)
+        copy.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+        copy.memory, copy.nstack, copy.njmax, copy.nconmax = -1, -1, -1, -1
+        model = copy.compile()
+        buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, buffer)
+        return buffer.tobytes()
+    return None
 
 
 def settings_from(words: Iterable[str]) -> dict[str, float]:
@@ -281,12 +312,37 @@ def _elements(spec: mujoco.MjSpec, setting: Effect, parameter: str) -> list[Any]
 
 @dataclass(slots=True)
 class _Place:
-    """One number of the MJCF and its terms: the sum of offset + factor · value."""
+    """One number of the MJCF and its terms: the sum of offset + factor · value.
+
+    Attributes:
+        element: Element of the specification that has the number.
+        setting: One of its terms, by which the number is named.
+        terms: Terms by parameter.
+        default: Sum of the terms with every parameter's default.
+        was: Number of the file if another one was set; else None.
+    """
 
     element: Any
     setting: Effect
     terms: dict[str, Effect] = field(default_factory=dict)
     default: float = 0.0
+    was: float | None = None
+
+    @property
+    def number(self) -> float:
+        """The number in the specification, in the unit of the MJCF."""
+        values = np.array(getattr(self.element, self.setting.field), dtype=np.float64)
+        return float(values[self._index])
+
+    @number.setter
+    def number(self, value: float) -> None:
+        values = np.array(getattr(self.element, self.setting.field), dtype=np.float64)
+        values[self._index] = value
+        setattr(self.element, self.setting.field, values if values.ndim else value)
+
+    @property
+    def _index(self) -> tuple[()] | int:
+        return () if self.setting.index is None else self.setting.index
 
     def add(self, parameter: Parameter, setting: Effect) -> None:
         """Adds the term of a parameter."""
@@ -297,27 +353,36 @@ class _Place:
 
     def set(self, effective: Mapping[str, float], requested: Mapping[str, float]) -> None:
         """Checks the default against the file, then sets the number if it was requested."""
-        names, index = " and ".join(map(repr, self.terms)), self.setting.index
-        is_one = len(self.terms) == 1
-        subject = f"parameter {names} sets" if is_one else f"parameters {names} together set"
-        where = f"{subject} {self._words}"
         try:
-            values = np.array(getattr(self.element, self.setting.field), dtype=np.float64)
-            now = float(values[() if index is None else index])
+            now = self.number
         except (AttributeError, TypeError, ValueError, IndexError):
-            raise SceneError(f"{where}, which is not a number of the scene") from None
-        if not math.isclose(now, self.default, rel_tol=_AGREEMENT, abs_tol=_ROUNDING):
+            raise SceneError(f"{self.subject}, which is not a number of the scene") from None
+        if not self._is(now, self.default):
             raise SceneError(
-                f"{where} to {self.default:g} by default, where the scene's file has {now:g}; make "
-                "them equal"
+                f"{self.subject} to {self.default:g} by default, where the scene's file has "
+                f"{now:g}; make them equal"
             )
         if not requested.keys() & self.terms.keys():
             return
-        result = sum(
+        self.number = result = sum(
             term.offset + term.factor * effective[name] for name, term in self.terms.items()
         )
-        values[() if index is None else index] = result
-        setattr(self.element, self.setting.field, result if index is None else values)
+        self.was = None if self._is(now, result) else now
+
+    @staticmethod
+    def _is(number: float, other: float) -> bool:
+        return math.isclose(number, other, rel_tol=_AGREEMENT, abs_tol=_ROUNDING)
+
+    @property
+    def subject(self) -> str:
+        """Subject and verb of a sentence: which parameters set the number."""
+        names = " and ".join(map(repr, self.terms))
+        start = (
+            f"parameter {names} sets"
+            if len(self.terms) == 1
+            else f"parameters {names} together set"
+        )
+        return f"{start} {self._words}"
 
     @property
     def _words(self) -> str:

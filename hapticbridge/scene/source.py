@@ -10,10 +10,10 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape, unescape
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from hapticbridge.errors import SceneError
 from hapticbridge.scene.parameters import parameters_file
@@ -111,6 +111,34 @@ def collect_sources(path: Path, main: bytes | None = None) -> tuple[SourceFile, 
             inner = homes[key].with_inner_names(data, name.count("/"), root)
         sources.append(SourceFile(name, inner))
     return tuple(sources)
+
+
+def with_assets(
+    sources: tuple[SourceFile, ...], assets: Mapping[str, bytes]
+) -> tuple[SourceFile, ...]:
+    """Returns the sources of a specification with the assets that it holds in memory.
+
+    MuJoCo finds an asset in memory before a file on the disk: by the whole path of the file that an
+    element names, by its name as written or by the last part of both, in any case of letters. It
+    finds a file only at its path, where each asset is placed. Assets that no element names are left
+    out.
+    """
+    main, held = sources[0], {name.casefold(): data for name, data in assets.items()}
+    lasts = [_parts(name)[-1] for name in held]
+    held |= {
+        last: held[name] for name, last in zip(held, lasts, strict=True) if lasts.count(last) == 1
+    }
+    found = {source.name: source for source in sources}
+    elements = list(read_elements(main.data))
+    folders, home = _asset_folders(elements), PurePosixPath(main.name).parent
+    for element in elements:
+        for reference in filter(None, map(element.attributes.get, _FILE_ATTRIBUTES)):
+            inner = next(_candidates(reference, element.tag, (Path(), Path()), folders)).as_posix()
+            names = map(str.casefold, (inner, reference, _parts(reference)[-1]))
+            if (name := next(filter(held.__contains__, names), None)) is not None:
+                place = (home / inner).as_posix()
+                found[place] = SourceFile(place, held[name])
+    return tuple(found.values())
 
 
 def _named_in(file: Path, root: Path) -> str:
