@@ -7,6 +7,7 @@ import ctypes
 import errno
 import gc
 import os
+import re
 import resource
 import signal
 import socket
@@ -208,13 +209,13 @@ def chunk(content: bytes) -> bytes:
     ("content", "count", "words"),
     [
         (bytes(1 << 22), 20, "more than 100 times the file"),
-        (bytes(1 << 23), 20, "is beyond"),
+        (bytes((1 << 25) + 1), 3, "more than 33554432 .'mcap filter' writes smaller"),
         (struct.pack("<BQ", 0x7F, 0) * 400_000, 1, "holds a record of kind 127"),
         (struct.pack("<BQHIQQ", 5, 22, 99, 0, 0, 0) * 100_000, 1, "does not match"),
     ],
     ids=[
         "80 MB in small chunks",
-        "160 MB in large chunks",
+        "100 MB in large chunks",
         "unknown records",
         "messages of no topic",
     ],
@@ -227,7 +228,7 @@ def test_a_small_file_that_unpacks_to_much_is_not_unpacked(
         at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
     path.write_bytes(data[:at] + count * chunk(content) + data[at:])
     before = resource.getrusage(resource.RUSAGE_SELF).ru_utime
-    assert words in "; ".join(read_recording(path).problems)
+    assert re.search(words, "; ".join(read_recording(path).problems))
     assert resource.getrusage(resource.RUSAGE_SELF).ru_utime - before < 6.0
 
 
