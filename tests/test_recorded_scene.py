@@ -7,7 +7,6 @@ import ctypes
 import errno
 import gc
 import os
-import re
 import resource
 import signal
 import socket
@@ -209,7 +208,7 @@ def chunk(content: bytes) -> bytes:
     ("content", "count", "words"),
     [
         (bytes(1 << 22), 20, "more than 100 times the file"),
-        (bytes((1 << 25) + 1), 3, "more than 33554432 .'mcap filter' writes smaller"),
+        (bytes((1 << 25) + 1), 3, "bytes, more than 33554432"),
         (struct.pack("<BQ", 0x7F, 0) * 400_000, 1, "holds a record of kind 127"),
         (struct.pack("<BQHIQQ", 5, 22, 99, 0, 0, 0) * 100_000, 1, "does not match"),
     ],
@@ -228,7 +227,7 @@ def test_a_small_file_that_unpacks_to_much_is_not_unpacked(
         at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
     path.write_bytes(data[:at] + count * chunk(content) + data[at:])
     before = resource.getrusage(resource.RUSAGE_SELF).ru_utime
-    assert re.search(words, "; ".join(read_recording(path).problems))
+    assert words in "; ".join(read_recording(path).problems)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_utime - before < 6.0
 
 

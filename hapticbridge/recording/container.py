@@ -325,12 +325,13 @@ class Container:
                     size = self._claimed_size(body, stop)
                     label = f"chunk {count} (at byte {start})"
                     if size > min(room, MAX_CHUNK_SIZE):
-                        self.problems.append(
-                            f"{label} is not read: it claims {size} bytes, more than "
-                            f"{MAX_CHUNK_SIZE} ('mcap filter' writes smaller chunks)"
+                        limit = (
+                            f"more than {MAX_CHUNK_SIZE}"
                             if size > MAX_CHUNK_SIZE
-                            else f"{label} is not read: it claims {size} bytes, and all chunks "
-                            f"more than {MAX_RATIO} times the file"
+                            else f"and all chunks more than {MAX_RATIO} times the file"
+                        )
+                        self.problems.append(
+                            f"{label} is not read: it claims {size} bytes, {limit}"
                         )
                         continue
                     room, largest = room - size, max(largest, size)
