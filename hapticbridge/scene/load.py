@@ -16,7 +16,7 @@ import mujoco
 
 from hapticbridge.arguments import shown
 from hapticbridge.errors import SceneError, SceneWarning, choices, nearest
-from hapticbridge.files import name_fault
+from hapticbridge.files import folder_words, name_fault
 from hapticbridge.kernel.mujoco_c import quiet, warnings_of_reading
 from hapticbridge.scene.checks import (
     MAY_BE_ACTIVE,
@@ -444,7 +444,9 @@ def _refused(path: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
-        raise SceneError(f"cannot compile scene '{path}': {_found_nowhere(path, error)}") from None
+        words = folder_words(error) if isinstance(error, OSError) else ""
+        words = words or _found_nowhere(path, error)
+        raise SceneError(f"cannot compile scene '{path}': {words}") from None
 
 
 def _found_nowhere(path: Path, error: Exception) -> str:
