@@ -233,6 +233,27 @@ def test_a_folder_that_takes_no_file_is_the_reason_in_each_format(
         assert err.endswith(f"cannot write '/proc/x{ending}': the folder /proc takes no new file\n")
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "run point_mass --fast --duration 0.01 --record FOLDER",
+        "export FILE --format csv --out FOLDER.csv",
+        "view FILE --save FOLDER.html",
+        "render FILE FOLDER.png",
+    ],
+)
+def test_a_folder_in_the_place_of_a_file_is_told_and_not_offered_to_be_replaced(
+    run_file: Path, tmp_path: Path, call: Called, words: str
+) -> None:
+    target = tmp_path / words.rpartition("FOLDER")[2].join(("folder", ""))
+    target.mkdir()
+    command = words.replace("FILE", str(run_file)).replace("FOLDER", str(tmp_path / "folder"))
+    code, _, err = call(*command.split())
+    assert code == 2
+    assert f"error: cannot write '{target}': it " in err
+    assert "--overwrite" not in err
+
+
 def test_a_recording_is_never_replaced_by_its_export(recording: Path) -> None:
     before = recording.read_bytes()
     # whatever it is called, and whichever way leads to it

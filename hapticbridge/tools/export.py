@@ -521,9 +521,9 @@ def export(
     for file in files:
         if file.exists() and file.samefile(recording.path):
             raise RecordingError(f"'{file}' is the recording itself; choose another file")
+        check_regular(file, RecordingError)
         if file.exists() and not overwrite:
             raise RecordingError(f"'{file}' exists; choose another file or add --overwrite")
-        check_regular(file, RecordingError)
     piece, count = _piece(recording, span), 0
     columns = _columns(recording, form, part)
     place = target.resolve()
