@@ -13,6 +13,7 @@ import shlex
 import shutil
 import sys
 import tempfile
+import zlib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -162,6 +163,35 @@ def folder_words(error: OSError) -> str:
     if named:
         return ""
     return f"{error.strerror}; free space there, lift 'ulimit -f', or set TMPDIR to another folder"
+
+
+def is_unicode(text: str) -> bool:
+    """Returns False for a name or a word of a command line whose bytes are no UTF-8."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def name_fault(path: Path, reader: str) -> str:
+    """Returns why a library cannot be given a name that is no Unicode text; empty if it is text."""
+    if is_unicode(str(path)):
+        return ""
+    try:
+        os.fsencode(path).decode()
+    except UnicodeDecodeError:
+        return f"{reader} needs a name in UTF-8"
+    encoding = sys.getfilesystemencoding()
+    return f"Python reads names as {encoding} here; set PYTHONUTF8=1, or a locale with UTF-8"
+
+
+def draft_of(target: Path) -> Path:
+    """Returns the place of a file or folder until it is whole.
+
+    Its name is short and ASCII, so that it can be made wherever the target can.
+    """
+    return target.with_name(f".{zlib.crc32(os.fsencode(target.name)):08x}.draft")
 
 
 def remove_file(path: Path) -> None:

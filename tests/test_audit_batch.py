@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import importlib
 import json
+import os
 import re
+import sys
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
@@ -52,6 +54,13 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "foreign.mcap").write_bytes(b"\x89MCAP0\r\n" + b"nothing")
     (folder / "notes.txt").write_text("not looked at")
     return folder
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_a_name_that_is_no_utf_8_is_named_as_what_no_table_takes(runs: Path) -> None:
+    named = Path(os.fsdecode(b"gr\xf6\xdfe.mcap"))
+    with pytest.raises(RecordingError, match=r"in no table: a table needs a name in UTF-8"):
+        audit_all([runs / "stiff.mcap", named])
 
 
 def test_a_folder_is_searched_through_and_patterns_are_understood(runs: Path) -> None:

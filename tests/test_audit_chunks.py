@@ -184,6 +184,24 @@ def test_chunks_in_each_compression_of_mcap_are_read(
     assert audit(path).verdict == "passive"
 
 
+def test_chunks_as_large_as_other_programs_write_them_are_read(run: Path, tmp_path: Path) -> None:
+    parts, unpacked = Parts.of(run), b""
+    for chunk, *_ in parts.chunks:
+        unpacked += zstandard.ZstdDecompressor().decompress(chunk.data, chunk.uncompressed_size)
+    # 'mcap filter' closes a chunk with the message that leads it beyond 4 MiB
+    builder = RecordBuilder()
+    records.Schema(id=99, name="unused", encoding="ros2msg", data=bytes(1 << 22)).write(builder)
+    unpacked += builder.end()  # type: ignore[no-untyped-call]
+    first, last = parts.chunks[0][0], parts.chunks[-1][0]
+    first.data, first.message_end_time = zstandard.compress(unpacked), last.message_end_time
+    first.uncompressed_size, first.uncompressed_crc = len(unpacked), zlib.crc32(unpacked)
+    parts.chunks = [[first]]
+    path = parts.write(tmp_path / "one.mcap")
+    assert read_recording(path).problems == ()
+    assert (read_recording(path).ticks == read_recording(run).ticks).all()
+    assert audit(path).verdict == "passive"
+
+
 DAMAGED: dict[str, tuple[Callable[[bytes], bytes], str, str]] = {
     "cut": (lambda data: lz4.frame.compress(data)[:-40], "lz4", "its checksum does not match"),
     "torn": (lambda data: lz4.frame.compress(data)[9:], "lz4", "it does not decompress"),

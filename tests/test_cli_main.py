@@ -303,15 +303,16 @@ def test_help_does_not_need_the_docstrings_that_python_drops(command: str, call:
 
 
 @pytest.mark.parametrize(
-    "words", ["run point_mass --fast --duration 0.01 --record a.mcap", "new-scene mine"]
+    "words",
+    ["run point_mass --fast --duration 0.01 --record a.mcap", "new-scene mine", "serve --port 0"],
 )
 def test_a_current_folder_that_was_removed_is_the_reason(tmp_path: Path, words: str) -> None:
     script = f"import os; os.chdir({str(tmp_path)!r}); os.rmdir(os.getcwd()); " + LOADED
     command = [sys.executable, "-P", "-c", script, *words.split()]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
-    assert one_sentence(done.stderr.partition("loaded:")[0]) == (
-        "error: the current folder was removed; change to another one"
+    assert one_sentence(done.stderr.partition("loaded:")[0]).endswith(
+        ": the current folder was removed; change to another one"
     )
 
 

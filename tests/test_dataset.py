@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import io
 import json
+import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -273,6 +275,22 @@ def test_options_that_do_not_go_together_are_a_sentence(
     code, out, err = call("export", str(runs[0]), *words)
     assert (code, out) == (2, "")
     assert said in one_sentence(err)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+@pytest.mark.parametrize("form", ["lerobot", "robomimic"])
+def test_names_and_a_task_that_are_no_utf_8(
+    form: str, runs: list[Path], tmp_path: Path, call: Called
+) -> None:
+    word = os.fsdecode(b"gr\xf6\xdfe")
+    named = tmp_path / f"{word}.mcap"
+    named.write_bytes(runs[1].read_bytes())
+    write_dataset([named], form, tmp_path / word)
+    write_dataset([named], form, tmp_path / ("L" * 255))
+    words = "export", named, "--format", form, "--out", tmp_path / "set"
+    sentence = one_sentence(call(*words, "--task", word)[2])
+    assert "the task 'gr\\udcf6\\udcdfe' is not in UTF-8" in sentence
+    assert sorted(tmp_path.iterdir()) == sorted([named, tmp_path / word, tmp_path / ("L" * 255)])
 
 
 def test_several_recordings_are_no_table(call: Called, runs: list[Path]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes.util
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -85,6 +86,27 @@ def test_a_library_is_named_or_found(
     broken.write_bytes(b"no library")
     with pytest.raises(DeviceError, match="cannot be loaded"):
         open_device(f"{maker.name}:library={broken}")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not name what is missing")
+@each_maker
+def test_a_library_without_one_that_it_needs_is_found_and_names_it(
+    maker: Maker, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler (cc)")
+    source, needed, target = (tmp_path / name for name in ("a.c", "libgone.so", "libmaker.so"))
+    source.write_text("int needed(void) { return 1; }")
+    for out, more in ((needed, ()), (target, ("-Wl,--no-as-needed", needed))):
+        subprocess.run([compiler, "-shared", "-fPIC", source, *more, "-o", out], check=True)
+    needed.unlink()
+    monkeypatch.delenv(maker.files.variable, raising=False)
+    monkeypatch.setattr(ctypes.util, "find_library", lambda stem: None)
+    names = {"linux": (str(tmp_path / "absent.so"), str(target))}
+    monkeypatch.setattr(maker.driver, "FILES", replace(maker.files, names=names))
+    with pytest.raises(DeviceError, match=r"libmaker\.so' cannot be loaded: .*libgone\.so"):
+        open_device(maker.name)
 
 
 @each_maker

@@ -365,10 +365,14 @@ def test_a_bag_in_sqlite_and_a_folder_of_several_are_told(tmp_path: Path) -> Non
     bag = tmp_path / "bag"
     bag.mkdir()
     (bag / "bag_0.db3").write_bytes(b"SQLite format 3\0")
-    for path in (bag, bag / "bag_0.db3"):
+    for path in (bag, bag / "bag_0.db3", f"{bag}:/pose"):
         with pytest.raises(DeviceError, match="in SQLite; 'ros2 bag convert' writes it in MCAP"):
             open_device(f"trajectory:{path}")
-    for name in ("a.mcap", "b.mcap"):
+    for name in ("a.mcap", "b.mcap", "notes.gz"):
         (tmp_path / name).touch()
-    with pytest.raises(DeviceError, match=r"a folder of 2 files; name one of 'a\.mcap', 'b\.mcap'"):
-        open_device(f"trajectory:{tmp_path}")
+    for path in (tmp_path, f"{tmp_path}:/pose"):
+        with pytest.raises(DeviceError, match=r"of 2 files; name one of 'a\.mcap', 'b\.mcap'"):
+            open_device(f"trajectory:{path}")
+    (tmp_path / "hand.csv").write_text(table(1, 1))
+    with pytest.raises(DeviceError, match="'/pose', is of a bag in MCAP, which this is not"):
+        open_device(f"trajectory:{tmp_path / 'hand.csv'}:/pose")

@@ -28,6 +28,7 @@ from hapticbridge.kernel.record import FORMAT, TICK_DTYPE, TickFlag
 from hapticbridge.recording import read_recording, reader
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.tools.export import ENERGIES, Part, export, sidecar_of
+from hapticbridge.tools.export import FORMATS as WRITERS
 
 h5py: Any = importlib.import_module("h5py")
 pq: Any = importlib.import_module("pyarrow.parquet")
@@ -202,6 +203,55 @@ def test_hdf5_keeps_no_more_chunks_than_it_writes(
     export(recording, "hdf5")
     assert len(caches) == TICK_DTYPE.itemsize // 8 + 1  # and the seconds
     assert sum(caches) < 10e6
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+@pytest.mark.parametrize("form", WRITERS)
+def test_a_name_that_is_no_utf_8_or_as_long_as_a_name_may_be_is_written(
+    form: str, run_file: Path, tmp_path: Path, call: Called
+) -> None:
+    ending = WRITERS[form][1][0]
+    folder = tmp_path / os.fsdecode(b"l\xe4nge")
+    folder.mkdir()
+    for name in (os.fsdecode(b"gr\xf6\xdfe"), "L" * (250 - len(ending))):
+        target = (tmp_path if form == "rerun" else folder) / f"{name}{ending}"
+        assert call("export", run_file, "--format", form, "--out", target)[0] == 0
+        assert target.stat().st_size > 0
+    assert not [each for each in folder.iterdir() if each.name.startswith(".")]
+    if form == "rerun":  # its library takes names in UTF-8 alone, of the folder too
+        code, _, err = call("export", run_file, "--format", form, "--out", folder / "a.rrd")
+        assert (code, err.count("\n")) == (2, 1)
+        assert "rerun needs a name in UTF-8" in err
+
+
+def test_a_folder_that_takes_no_file_is_the_reason_in_each_format(
+    run_file: Path, call: Called
+) -> None:
+    for form, (_, (ending, *_)) in WRITERS.items():
+        code, _, err = call("export", run_file, "--format", form, "--out", f"/proc/x{ending}")
+        assert code == 2
+        assert err.endswith(f"cannot write '/proc/x{ending}': the folder /proc takes no new file\n")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "run point_mass --fast --duration 0.01 --record FOLDER",
+        "export FILE --format csv --out FOLDER.csv",
+        "view FILE --save FOLDER.html",
+        "render FILE FOLDER.png",
+    ],
+)
+def test_a_folder_in_the_place_of_a_file_is_told_and_not_offered_to_be_replaced(
+    run_file: Path, tmp_path: Path, call: Called, words: str
+) -> None:
+    target = tmp_path / words.rpartition("FOLDER")[2].join(("folder", ""))
+    target.mkdir()
+    command = words.replace("FILE", str(run_file)).replace("FOLDER", str(tmp_path / "folder"))
+    code, _, err = call(*command.split())
+    assert code == 2
+    assert f"error: cannot write '{target}': it " in err
+    assert "--overwrite" not in err
 
 
 def test_a_recording_is_never_replaced_by_its_export(recording: Path) -> None:

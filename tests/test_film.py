@@ -306,6 +306,17 @@ def test_where_no_renderer_works_a_sentence_says_what_to_install(
         still(sway, Shot())
 
 
+@pytest.mark.parametrize("name", ["glfw", "glx"])
+def test_a_renderer_that_needs_a_display_is_the_reason_where_there_is_none(
+    sway: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    for display in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(display, raising=False)
+    monkeypatch.setenv("MUJOCO_GL", name)
+    with pytest.raises(HapticBridgeError, match=f"MUJOCO_GL={name} does not .* try egl or osmesa"):
+        still(sway, Shot())
+
+
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
 def test_a_signal_ends_the_drawing_at_once(
     sway: Path, tmp_path: Path, work: Callable[..., None], name: str

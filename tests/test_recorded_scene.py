@@ -208,13 +208,13 @@ def chunk(content: bytes) -> bytes:
     ("content", "count", "words"),
     [
         (bytes(1 << 22), 20, "more than 100 times the file"),
-        (bytes(1 << 23), 20, "is beyond"),
+        (bytes((1 << 25) + 1), 3, "bytes, more than 33554432"),
         (struct.pack("<BQ", 0x7F, 0) * 400_000, 1, "holds a record of kind 127"),
         (struct.pack("<BQHIQQ", 5, 22, 99, 0, 0, 0) * 100_000, 1, "does not match"),
     ],
     ids=[
         "80 MB in small chunks",
-        "160 MB in large chunks",
+        "100 MB in large chunks",
         "unknown records",
         "messages of no topic",
     ],

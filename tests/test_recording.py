@@ -595,4 +595,4 @@ def test_damaged_length_loses_no_later_chunk(whole: Path, tmp_path: Path) -> Non
 def test_chunk_that_claims_exabytes_is_not_allocated(whole: Path, tmp_path: Path) -> None:
     data = bytearray(whole.read_bytes())
     struct.pack_into("<Q", data, chunks(whole)[0][0] + 9 + 16, 1 << 60)
-    assert any("beyond" in problem for problem in changed(tmp_path / "a.mcap", data).problems)
+    assert any("is not read" in problem for problem in changed(tmp_path / "a.mcap", data).problems)

@@ -15,7 +15,7 @@ import numpy as np
 from hapticbridge.audit import audit
 from hapticbridge.confinement import ForeignSceneError
 from hapticbridge.errors import RecordingError, StudyError, choices
-from hapticbridge.files import check_target, finite_or_null, reason_of
+from hapticbridge.files import check_target, finite_or_null, name_fault, reason_of
 from hapticbridge.sweep import Interrupted, Table, Value, Workers, check_format, sweep
 
 FEW = 8
@@ -87,11 +87,14 @@ def audit_all(
 
     Raises:
         StudyError: The workers cannot be started or reached.
-        RecordingError: ``paths`` is empty.
+        RecordingError: ``paths`` is empty, or a name is no Unicode text.
         Interrupted: Ctrl-C was pressed; its table holds the finished rows in this order.
     """
     if not paths:
         raise RecordingError("audit needs at least one recording")
+    for path in paths:
+        if fault := name_fault(path, "a table"):
+            raise RecordingError(f"'{path}' is in no table: {fault}")
     if workers is None and len(paths) < FEW:
         workers = 1
     is_far = isinstance(workers, str)

@@ -74,9 +74,9 @@ class View:
     def _check_page(self, path: Path) -> None:
         if path.suffix.lower() != ".html":
             raise RecordingError(f"--save is '{path}'; the page must end in .html")
+        check_target(path, RecordingError)
         if path.exists() and not self.overwrite:
             raise RecordingError(f"'{path}' exists; choose another file or add --overwrite")
-        check_target(path, RecordingError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +107,7 @@ class Render:
 
     def execute(self) -> int:
         """Draws; returns the exit code."""
+        check_target(self.output, RecordingError)
         if self.output.exists() and not self.overwrite:
             raise RecordingError(f"'{self.output}' exists; choose another file or add --overwrite")
         shot = self.shot

@@ -442,11 +442,13 @@ def _open_trajectory(rest: str, options: Mapping[str, object]) -> Device:
     if not rest:
         raise DeviceError("trajectory needs a file: 'trajectory:FILE', a CSV file or a recording")
     path, topic = _named_topic(rest)
-    if topic or (_is_recording(path) and is_bag(path)):
-        return TrajectoryDevice(read_bag(path, topic), **limits)
     if not _is_recording(path):
         _refuse_other_bag(path)
+        if topic:
+            raise DeviceError(f"{path}: a topic, '{topic}', is of a bag in MCAP, which this is not")
         return TrajectoryDevice(read_motion(path), **limits)
+    if topic or is_bag(path):
+        return TrajectoryDevice(read_bag(path, topic), **limits)
     # imported here, because the package device must not depend on recordings; only the replay of a
     # recording needs the reader
     from hapticbridge.recording import read_recording  # noqa: PLC0415
@@ -500,11 +502,11 @@ def _refuse_other_bag(path: Path) -> None:
         files = sorted(path.iterdir()) if path.is_dir() else [path]
     except OSError:  # reading it as a motion then reports the reason
         return
-    if kind := next((_OTHER_BAGS[file.suffix] for file in files if file.suffix in _OTHER_BAGS), ""):
-        raise DeviceError(f"{path}: {kind}")
     bags = [file.name for file in files if file.suffix == ".mcap"]
     if len(bags) > 1:
         raise DeviceError(f"{path}: a folder of {len(bags)} files; name one of {choices(bags[:8])}")
+    if kind := next((_OTHER_BAGS[file.suffix] for file in files if file.suffix in _OTHER_BAGS), ""):
+        raise DeviceError(f"{path}: {kind}")
 
 
 def _is_recording(path: Path) -> bool:

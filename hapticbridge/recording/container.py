@@ -183,9 +183,9 @@ def refuse_replacing(path: Path) -> None:
             )
 
 
-MAX_CHUNK_SIZE = 1 << 22
+MAX_CHUNK_SIZE = 1 << 25
 """Largest chunk in bytes that is decompressed; a damaged size must not exhaust memory. The recorder
-writes 128 kB."""
+writes 128 kB; other programs close a chunk when it has passed 4 MiB, such as ``mcap filter``."""
 
 MAX_RATIO, FREE_SIZE = 100, 1 << 25
 """Bytes that all chunks may hold per byte of the file, without unit, and the bytes that they may
@@ -196,8 +196,9 @@ _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQI")
 _FOOTER = struct.Struct("<QQI")
 _FOOTER_SIZE = _RECORD.size + _FOOTER.size
-_AHEAD = 64
-"""Number of chunks decompressed in advance: about 8 MB of records at 128 kB each."""
+_AHEAD, _USUAL_SIZE = 1 << 23, 1 << 17
+"""Bytes of chunks that are decompressed in advance, and bytes that each is taken for at least: 64
+chunks of the recorder."""
 
 
 @dataclass(frozen=True)
@@ -316,21 +317,24 @@ class Container:
         """
         with ThreadPoolExecutor(2) as pool:
             ahead: deque[_Record | Future[Block]] = deque()
-            count, room = 0, FREE_SIZE + MAX_RATIO * len(self._data)
+            count, room, largest = 0, FREE_SIZE + MAX_RATIO * len(self._data), _USUAL_SIZE
             for opcode, body, stop in self._data_section():
                 start = body - _RECORD.size
                 if opcode == Opcode.CHUNK:
                     count += 1
                     size = self._claimed_size(body, stop)
-                    size = 0 if size > MAX_CHUNK_SIZE else size  # refused by itself
-                    if size > room:
+                    label = f"chunk {count} (at byte {start})"
+                    if size > min(room, MAX_CHUNK_SIZE):
+                        limit = (
+                            f"more than {MAX_CHUNK_SIZE}"
+                            if size > MAX_CHUNK_SIZE
+                            else f"and all chunks more than {MAX_RATIO} times the file"
+                        )
                         self.problems.append(
-                            f"chunk {count} (at byte {start}) is not read: it claims {size} bytes, "
-                            f"and all chunks more than {MAX_RATIO} times the file"
+                            f"{label} is not read: it claims {size} bytes, {limit}"
                         )
                         continue
-                    room -= size
-                    label = f"chunk {count} (at byte {start})"
+                    room, largest = room - size, max(largest, size)
                     ahead.append(pool.submit(self._unpack, label, start, stop))
                 elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
                     ahead.append(Block(f"the record at byte {start}", self._data[start:stop]))
@@ -338,7 +342,7 @@ class Container:
                     if opcode == Opcode.ATTACHMENT:
                         self._check_attachment(body, stop)
                     ahead.append((opcode, Fields(self._data, body, stop)))
-                if len(ahead) > _AHEAD:
+                while len(ahead) * largest > _AHEAD:
                     yield self._finished(ahead.popleft())
             while ahead:
                 yield self._finished(ahead.popleft())
@@ -418,8 +422,6 @@ class Container:
 
 
 def _decompressed(compression: str, packed: bytes, size: int) -> bytes:
-    if size > MAX_CHUNK_SIZE:
-        raise DamageError(f"its size of {size} bytes is beyond {MAX_CHUNK_SIZE}")
     if not compression:
         return packed
     if compression not in ("lz4", "zstd"):

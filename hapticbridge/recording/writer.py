@@ -22,7 +22,7 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.files import reason_of
+from hapticbridge.files import is_unicode, reason_of
 from hapticbridge.kernel.record import FORMAT, TICK_DTYPE
 from hapticbridge.recording import format as layout
 from hapticbridge.recording import ros_messages
@@ -450,12 +450,8 @@ def check_contents(metadata: Mapping[str, str], attachments: Sequence[Attachment
     for text in texts:
         if not isinstance(text, str):
             raise RecordingError(f"metadata of a recording must be text, not {text!r}")
-        try:
-            text.encode()
-        except UnicodeEncodeError as error:
-            raise RecordingError(
-                f"metadata of a recording must be valid Unicode, not {text!r}"
-            ) from error
+        if not is_unicode(text):
+            raise RecordingError(f"metadata of a recording must be valid Unicode, not {text!r}")
     if twice := {name for name in names if names.count(name) > 1}:
         raise RecordingError(f"two attachments are named {sorted(twice)[0]!r}")
 

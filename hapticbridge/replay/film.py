@@ -304,7 +304,8 @@ class _Child:
                 if self._is_ready:
                     raise
         if requested:
-            raise HapticBridgeError(f"MUJOCO_GL={requested} does not work here; try egl or osmesa")
+            others = " or ".join(each for each in RENDERERS if each != requested)
+            raise HapticBridgeError(f"MUJOCO_GL={requested} does not work here; try {others}")
         raise HapticBridgeError(_NONE_WORKS)
 
     def result(self, work: Work, renderer: str | None = None) -> Any:
@@ -312,7 +313,7 @@ class _Child:
         environment = {**os.environ, "MUJOCO_GL": renderer or "disable"}
         # settings of another renderer
         environment.pop("PYOPENGL_PLATFORM", None)
-        prepare = partial(_load, renderer is not None, self._code)
+        prepare = partial(_load, renderer, self._code)
         fresh = Fresh(environment, prepare, self._is_limited)
         work = partial(_ready, work)
         with Confined(work, self._what, fresh=fresh, **self._bounds) as child:
@@ -328,12 +329,16 @@ class _Child:
 # Work of the child
 
 
-def _load(draws: bool, code: tuple[str, str, str]) -> None:
+def _load(renderer: str | None, code: tuple[str, str, str]) -> None:
     """Loads the renderer, if the work draws, and machine code."""
-    if draws:
+    if renderer is not None:
         from mujoco.rendering.classic.gl_context import GLContext  # noqa: PLC0415 - if it draws
 
-        GLContext(16, 16).free()
+        context = GLContext(16, 16)
+        if renderer not in RENDERERS:  # GLFW makes one without a display, too, in which none draws
+            context.make_current()
+            mujoco.MjrContext(mujoco.MjSpec().compile(), mujoco.mjtFontScale.mjFONTSCALE_50).free()
+        context.free()
     load_machine_code(*code)
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
 import re
-import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -18,6 +16,7 @@ import mujoco
 
 from hapticbridge.arguments import shown
 from hapticbridge.errors import SceneError, SceneWarning, choices, nearest
+from hapticbridge.files import folder_words, name_fault
 from hapticbridge.kernel.mujoco_c import copy_of, quiet, warnings_of_reading
 from hapticbridge.scene.checks import (
     MAY_BE_ACTIVE,
@@ -210,10 +209,8 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
         UserWarning: What MuJoCo warns of as it reads the file, such as a part's lost option.
     """
     path = scene_path(path_or_name)
-    try:
-        str(path).encode()
-    except UnicodeEncodeError:
-        raise SceneError(f"cannot read scene '{path}': {_name_fault(path)}") from None
+    if fault := name_fault(path, "MuJoCo"):
+        raise SceneError(f"cannot read scene '{path}': {fault}")
     if path.suffix.lower() in _MESHES:
         raise SceneError(
             f"scene '{path}' is a mesh; write an MJCF file that names it in <mesh name=… file=…/>"
@@ -233,16 +230,6 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
     for text in dict.fromkeys([*whole, *(line for line in told if line not in firsts)]):
         warnings.warn(f"MuJoCo: {'; '.join(text.splitlines())}", stacklevel=3)
     return SceneSource(path, spec, sources, values)
-
-
-def _name_fault(path: Path) -> str:
-    """Returns why a name that is no Unicode text cannot be read."""
-    try:
-        os.fsencode(path).decode()
-    except UnicodeDecodeError:
-        return "MuJoCo needs a name in UTF-8"
-    encoding = sys.getfilesystemencoding()
-    return f"Python reads names as {encoding} here; set PYTHONUTF8=1, or a locale with UTF-8"
 
 
 def spec_source(spec: mujoco.MjSpec) -> SceneSource:
@@ -462,7 +449,9 @@ def _refused(path: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
-        raise SceneError(f"cannot compile scene '{path}': {_found_nowhere(path, error)}") from None
+        words = folder_words(error) if isinstance(error, OSError) else ""
+        words = words or _found_nowhere(path, error)
+        raise SceneError(f"cannot compile scene '{path}': {words}") from None
 
 
 def _found_nowhere(path: Path, error: Exception) -> str:

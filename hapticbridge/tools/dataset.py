@@ -33,7 +33,14 @@ from numpy.typing import NDArray
 from hapticbridge.audit.verdict import unusual_end
 from hapticbridge.demand.trip import Trip
 from hapticbridge.errors import RecordingError, choices
-from hapticbridge.files import Hdf5File, import_extra, reason_of
+from hapticbridge.files import (
+    Hdf5File,
+    draft_of,
+    import_extra,
+    is_unicode,
+    printable,
+    reason_of,
+)
 from hapticbridge.kernel.record import force_on_hand
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.ros_messages import axes_of
@@ -243,9 +250,9 @@ class LeRobotWriter:
             _EPISODES.format(chunk_index=0, file_index=0),
             {name: self._arrow.array(values) for name, values in episodes.items()},
         )
-        self._pandas.DataFrame({"task_index": [0]}, index=[self._task]).to_parquet(
-            self._folder / "meta" / "tasks.parquet"
-        )
+        # opened here and below: pyarrow takes names in UTF-8 alone
+        with (self._folder / "meta" / "tasks.parquet").open("wb") as file:
+            self._pandas.DataFrame({"task_index": [0]}, index=[self._task]).to_parquet(file)
         stats: Stats = {}
         for name, parts in self._numbers.items():
             stats[name] = _statistics(np.concatenate(parts), self._frames)
@@ -290,7 +297,8 @@ class LeRobotWriter:
     def _write(self, name: str, columns: Mapping[str, Any]) -> None:
         path = self._folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._parquet.write_table(self._arrow.table(dict(columns)), path)
+        with path.open("wb") as file:
+            self._parquet.write_table(self._arrow.table(dict(columns)), file)
 
 
 def _label(shot: Shot) -> str:
@@ -372,7 +380,7 @@ class RobomimicWriter:
         """Implements ``Writer.add``."""
         count = len(episode)
         demo = self._data.create_group(f"demo_{len(self._actions)}")
-        demo.attrs["num_samples"], demo.attrs["recording"] = count, episode.name
+        demo.attrs["num_samples"], demo.attrs["recording"] = count, printable(episode.name)
         demo["states"] = episode.states
         for name, part in _ACTIONS.items():
             demo[f"action_dict/{name}"] = episode.values[ACTION][:, part]
@@ -468,20 +476,22 @@ def write_dataset(
         progress: Called with the finished and all frames, and the recording's name.
 
     Raises:
-        RecordingError: There is no recording, one is damaged, cut, of another scene than the
-            first or cannot be simulated again, the format is unknown, or the folder exists or
-            cannot be written.
+        RecordingError: The task is no Unicode text, there is no recording, one is damaged, cut, of
+            another scene than the first or cannot be simulated again, the format is unknown, or
+            the folder exists or cannot be written.
         HapticBridgeError: Nothing can be drawn here, or the scene has no such camera.
     """
     if form not in DATASETS:
         raise RecordingError(f"format {form!r:.60} is unknown; the formats are {choices(DATASETS)}")
     if not paths:
         raise RecordingError("a data set needs a recording at least")
+    if task and not is_unicode(task):
+        raise RecordingError(f"the task {task!r:.60} is not in UTF-8")
     shot, folder = shot or Shot(), Path(folder)
     if folder.exists():
         raise RecordingError(f"'{folder}' exists; choose another folder")
     recordings = [_sound(open_recording(path)) for path in paths]
-    draft, counts = folder.with_name(f".{folder.name}.draft"), []
+    draft, counts = draft_of(folder), []
     try:
         shutil.rmtree(draft, ignore_errors=True)
         draft.mkdir()

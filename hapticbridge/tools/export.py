@@ -17,7 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
-from hapticbridge.files import Hdf5File, check_regular, import_extra, reason_of
+from hapticbridge.files import (
+    Hdf5File,
+    check_regular,
+    draft_of,
+    import_extra,
+    name_fault,
+    reason_of,
+)
 from hapticbridge.kernel.record import (
     FLAG_LEGEND,
     TICK_DTYPE,
@@ -73,7 +80,8 @@ class CsvSink:
             "events": recording.events,
         }
         text = json.dumps(about, indent=1, ensure_ascii=False)
-        sidecar_of(path).write_text(text + "\n", encoding="utf-8")
+        # what is no Unicode in an event's text stays an escape of JSON
+        sidecar_of(path).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
         self._file = path.open("w", encoding="utf-8", newline="")
         # sensors may have any name
         csv.writer(self._file, lineterminator="\n").writerow(self._columns.units)
@@ -179,9 +187,11 @@ class ParquetSink:
             "hapticbridge.flags": json.dumps(FLAG_LEGEND),
         }
         self._schema = self._arrow.schema(fields, metadata=about)
+        # opened here: pyarrow takes names in UTF-8 alone
+        self._file = path.open("wb")
         # values rarely repeat, so a dictionary would only take space
         self._writer = parquet.ParquetWriter(
-            path, self._schema, compression="zstd", use_dictionary=False
+            self._file, self._schema, compression="zstd", use_dictionary=False
         )
 
     def add(self, ticks: NDArray[np.void]) -> None:
@@ -191,7 +201,8 @@ class ParquetSink:
 
     def close(self) -> None:
         """Implements ``Sink.close``."""
-        self._writer.close()
+        with self._file:
+            self._writer.close()
 
 
 # Viewers rerun and Foxglove, each with an arrangement of its panels
@@ -231,11 +242,13 @@ class RerunSink:
     under ``events``. The timeline ``time`` is that of the run, in s.
 
     Raises:
-        RecordingError: rerun is not installed.
+        RecordingError: rerun is not installed, or cannot be given the folder's name.
     """
 
     def __init__(self, path: Path, recording: RecordingFile, columns: TableColumns) -> None:
         self._rerun = import_extra("rerun", "a file for rerun", "rerun", RecordingError)
+        if fault := name_fault(path.parent, "rerun"):
+            raise RecordingError(f"cannot write into the folder '{path.parent}': {fault}")
         self._target, self._path = path, list[NDArray[np.float64]]()
         self._period, self._axes = recording.period, axes_of(recording.meta)
         name = f"hapticbridge: {recording.meta.get('scene', '')}"
@@ -508,13 +521,13 @@ def export(
     for file in files:
         if file.exists() and file.samefile(recording.path):
             raise RecordingError(f"'{file}' is the recording itself; choose another file")
+        check_regular(file, RecordingError)
         if file.exists() and not overwrite:
             raise RecordingError(f"'{file}' exists; choose another file or add --overwrite")
-        check_regular(file, RecordingError)
     piece, count = _piece(recording, span), 0
     columns = _columns(recording, form, part)
     place = target.resolve()
-    draft = place.with_name(f".{place.name}.draft")
+    draft = draft_of(place)
     drafts = (draft, sidecar_of(draft)) if form == "csv" else (draft,)
     try:
         sink = sink_type(draft, piece, columns)

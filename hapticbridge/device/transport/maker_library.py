@@ -97,7 +97,9 @@ class LibraryFiles:
         for name in self.names.get(sys.platform, ()):
             try:
                 ctypes.CDLL(name)
-            except OSError:
-                continue
+            except OSError as error:
+                # Linux names the file that is missing: this one, or one that it needs
+                if sys.platform != "linux" or str(error).startswith(f"{name}: "):
+                    continue
             return name
         raise DeviceError(f"{self.missing} and name its file with library=FILE or {self.variable}")
