@@ -9,14 +9,14 @@ its normal impulse P_c in N s is noted. In its *restitution* the row is aimed at
 The coefficient e is that of the row's own ``solref``. The rebound w is e times the speed at the
 surface, taken to the place where the step ends (``rebound_speed``); forces that press in the step
 count as in a flight, constraints do not. Of a mocap body's move, δ/h is part of v_n and comes off ŵ
-again. The lift of sliding is subtracted as ever; a step is repeated until its rebound is met within
-``REBOUND_ERROR``.
+again. The lift of sliding is subtracted as ever. A step is repeated up to three times for an error
+of its rebounds beyond ``REBOUND_ERROR``, and as often for the impulses; what is left then, stays.
 
 That is Newton's rule where no friction couples normal and sliding, and elsewhere the smaller of
 Newton's and Poisson's rebound. Newton's alone may create energy: 0.041 J with a rod of 1 kg that
 falls at 1 m/s (e = 0.9), where Poisson's takes 0.144 J. Along Routh's path Poisson's takes energy
-at any one point. Of several at once nothing of the kind is known, so each step is judged. Its
-energy is, with C given by the rows and the remainder r,
+at any one point of a planar impact. Of several at once nothing of the kind is known, so each step
+is judged. Its energy is, with C given by the rows and the remainder r,
 
     E_k = C − ½‖v⁺ − v‖²_M + r
 

@@ -153,9 +153,10 @@ FORCE_ERROR = 0.02
 OPEN = -1e3
 """Wanted velocity in m/s of a blocked contact without force. No sliding closes it."""
 
-MAX_CUT = 0.9
-"""Largest share of a rebound that stays when a step gives too much energy, without unit. A larger
-one keeps more of the rebound and repeats more steps."""
+MAX_CUT = 0.99
+"""Largest ρ after a first step that gives too much energy, without unit. After each other one it is
+at most ``MAX_CUT`` ρ², so eight end any rebound. A larger one keeps more of the rebound and repeats
+more steps."""
 
 REBOUND_ERROR = 0.01
 """Largest error of a rebound's normal velocity, without unit, before the step is repeated."""
@@ -761,7 +762,7 @@ def _lower_rebound(contact: Part, allowed: float, returned: float) -> None:
     """
     ratio = contact.rebound_ratio
     part = max(allowed, 0.0) / returned * 2.0 * ratio / (1.0 + ratio)
-    ratio = min(part / (2.0 - part), MAX_CUT * ratio)
+    ratio = min(part / (2.0 - part), MAX_CUT * ratio**2)
     contact.rebound_ratio = ratio if ratio >= NOTABLE_BOUNCE else 0.0
     if contact.rebound_ratio == 0.0:
         contact.corrections = contact.blow_stage = 0
