@@ -254,6 +254,18 @@ def test_a_folder_in_the_place_of_a_file_is_told_and_not_offered_to_be_replaced(
     assert "--overwrite" not in err
 
 
+def test_a_pipe_in_the_place_of_a_recording_is_told_and_not_waited_for(
+    tmp_path: Path, call: Called
+) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    command = "run", "point_mass", "--fast", "--duration", "0.01", "--record", str(pipe)
+    for words in ((), ("--overwrite",)):
+        code, _, err = call(*command, *words)
+        assert code == 2
+        assert err.endswith(f"error: cannot write '{pipe}': it exists and is not a file\n")
+
+
 def test_a_recording_is_never_replaced_by_its_export(recording: Path) -> None:
     before = recording.read_bytes()
     # whatever it is called, and whichever way leads to it

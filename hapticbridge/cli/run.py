@@ -44,7 +44,7 @@ from hapticbridge.device.mouse import MouseDevice
 from hapticbridge.device.registry import is_device
 from hapticbridge.device.trajectory import DEFAULT_SECONDS
 from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, choices
-from hapticbridge.files import check_target
+from hapticbridge.files import check_regular, check_target
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
 from hapticbridge.recording.container import refuse_replacing
@@ -362,6 +362,7 @@ def refuse_overwriting(record: Path | None, *devices: str, overwrite: bool) -> N
     if not record.exists():
         return
     check_target(record, RecordingError)
+    check_regular(record, RecordingError)
     if not overwrite:
         raise RecordingError(f"'{record}' exists; choose another file or add --overwrite")
     refuse_replacing(record)

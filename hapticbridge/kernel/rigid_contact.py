@@ -649,6 +649,17 @@ def _unblock(s: State) -> bool:
 
 
 @compiled
+def _may_blow(s: State) -> bool:
+    """Returns True if a row may be a blow: one that closes fast, in a step of few enough rows."""
+    count, is_any = ints(s.mj.nefc, 1)[0], s.energy.mocap_has_moved
+    if count > MAX_ROWS:
+        return False
+    for velocity in floats(pointer_at(s.mj.efc_vel), count):
+        is_any |= velocity < -BLOW_SPEED
+    return bool(is_any)
+
+
+@compiled
 def _note_blows(s: State) -> None:
     """Notes the contacts and limits that close in a blow, and begins with their compression.
 
@@ -784,7 +795,7 @@ def aim_contacts(s: State) -> None:
         _note_blocked(s)
         if contact.pressing:
             ints(s.mj.enableflags, 1)[0] &= ~_EXACT_DIAGONAL
-        if contact.bounces and ints(s.mj.nefc, 1)[0] <= MAX_ROWS:
+        if contact.bounces and _may_blow(s):
             _note_blows(s)
         _aim(s)
         contact.is_aimed = 1
