@@ -23,6 +23,7 @@ from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.restitution import MAX_RESTITUTION, restitution, rigid_restitution
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
+from hapticbridge.lab.rebounds import damping_of
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.theory.impact import ImpactBody, Mode, resolve_impact
 
@@ -273,15 +274,6 @@ def test_newtons_rule_alone_creates_the_known_energy_and_poissons_impulse_takes_
     blow = fallen_rod(np.pi / 4, (0.8, -1.0), damping, 0.75, None)
     assert blow.created == pytest.approx(-0.144055, rel=2e-3)
     assert blow.tip == pytest.approx(poisson.velocity, abs=1e-3)
-
-
-def damping_of(e: float) -> float:
-    """Returns the damping ratio of a coefficient of restitution, by bisection."""
-    low, high = 0.0, 0.99
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if e_of(middle) > e else (low, middle)
-    return low
 
 
 def test_random_rods_have_the_smaller_of_newtons_and_poissons_rebound() -> None:
