@@ -161,6 +161,17 @@ def test_a_rebound_that_the_blow_pays_for_in_part_loses_little(drop: float, spee
     assert strict(run)
 
 
+def test_a_ball_that_is_pulled_away_leaves_with_e_of_its_speed() -> None:
+    e = e_of(0.1)
+    run = started(
+        scene(BALL.format(height=RADIUS + 0.0025), 0.1, -80.0), {"ball": (0, 0, -1, 0, 0, 0)}
+    )
+    speeds = resting(run, 0.006, lambda d: d.joint("ball").qvel[2])
+    blow = int(np.flatnonzero(np.diff(speeds) > 0.5)[0])
+    assert speeds[blow + 1] == pytest.approx(-e * speeds[blow], rel=2e-3)
+    assert strict(run)
+
+
 WALLS = """<geom type="box" size="0.01 0.1 0.1" pos="0.11 0 0"/>
   <geom type="box" size="0.01 0.1 0.1" pos="-0.11 0 0"/>
   <body name="ball"><joint name="ball" type="slide" axis="1 0 0"/>

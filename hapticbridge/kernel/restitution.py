@@ -4,13 +4,15 @@ A row that closes in the step is a *blow* if its normal velocity v_n at the star
 ``BLOW_SPEED``. The step is then solved twice. In its *compression* the row is aimed at ŵ = 0, and
 its normal impulse P_c in N s is noted. In its *restitution* the row is aimed at
 
-    ŵ = ρ w,    0 <= ρ <= 1,    with a normal impulse of at most (1 + e) P_c
+    ŵ = ρ w,    0 <= ρ <= 1,    with a normal impulse of at most P_c + e Q_c
 
-The coefficient e is that of the row's own ``solref``. The rebound w is e times the speed at the
-surface, taken to the place where the step ends (``rebound_speed``); forces that press in the step
-count as in a flight, constraints do not. Of a mocap body's move, δ/h is part of v_n and comes off ŵ
-again. The lift of sliding is subtracted as ever. A step is repeated up to three times for an error
-of its rebounds beyond ``REBOUND_ERROR``, and as often for the impulses; what is left then, stays.
+Q_c = P_c |v_n|/(|v_n| − h g_n) is the part of P_c that stops v_n, without what holds the free
+acceleration g_n of the step, in m/s². The coefficient e is that of the row's own ``solref``. The
+rebound w is e times the speed at the surface, taken to the place where the step ends
+(``rebound_speed``); forces that press in the step count as in a flight, constraints do not. Of a
+mocap body's move, δ/h is part of v_n and comes off ŵ again. The lift of sliding is subtracted as
+ever. A step is repeated up to three times for an error of its rebounds beyond ``REBOUND_ERROR``,
+and as often for the impulses; what is left then, stays.
 
 That is Newton's rule where no friction couples normal and sliding, and elsewhere the smaller of
 Newton's and Poisson's rebound. Newton's alone may create energy: 0.041 J with a rod of 1 kg that

@@ -210,7 +210,15 @@ _OF_MODEL = (
     *("body_invweight0", "dof_invweight0"),
 )
 _OF_DATA = ("geom_xpos", "subtree_com", "cdof", "ten_velocity", "qacc_smooth")
-_OF_BLOWS = ("restitutions", "approaches", "gaps", "pressings", "impulses", "rebounds")
+_OF_BLOWS = (
+    "restitutions",
+    "approaches",
+    "gaps",
+    "pressings",
+    "impulses",
+    "returnable",
+    "rebounds",
+)
 _OWNED = (
     *(f"own_{name}" for name in _PARAMETERS),
     *("eq_type", "row_positions", "row_shifts", "end_velocity", "moving_geoms", "body_velocity"),
@@ -270,9 +278,9 @@ is. ``solver`` is the address of MuJoCo's choice, ``own_solver`` that of the sce
 ``STALLED``, ``paid`` ``PAID``, and beyond 1 Newton's rule alone. ``bounces`` is 1 if a contact or
 limit may bounce. ``blow_stage`` is ``COMPRESSION`` or ``RESTITUTION`` in a step with a blow, or 0;
 ``rebound_ratio`` is ρ in restitution, else 0, and ``cuts`` counts the repetitions for impulses. Of
-each row that is a blow: e, −v_n in m/s, gap in m, a in m/s², P_c in N s and w in m/s, which is
-``NO_REBOUND`` where it is none. Two buffers have a number per degree of freedom. Of limits and
-equality constraints: largest count of rows (0 if there are none), and addresses of the model's
+each row that is a blow: e, −v_n in m/s, gap in m, a in m/s², P_c and e Q_c in N s, and w in m/s,
+which is ``NO_REBOUND`` where it is none. Two buffers have a number per degree of freedom. Of limits
+and equality constraints: largest count of rows (0 if there are none), and addresses of the model's
 parameters, of copies, of the rows' own positions, of the velocities taken from ŵ and of J v⁺. Of
 margins: addresses and counts of the geoms that move, of pairs, and of the bodies' velocities;
 ``leashes`` is 1 for spatial tendons of no least length."""
@@ -708,20 +716,22 @@ def _begin_restitution(s: State) -> None:
     """Notes the impulses of the compression that just ended, and aims at the rebounds."""
     mj, contact, h = s.mj, s.contact, s.run.timestep
     count = ints(mj.nefc, 1)[0]
-    impulses, rebounds = floats(contact.impulses, count), floats(contact.rebounds, count)
+    impulses, allowed = floats(contact.impulses, count), floats(contact.returnable, count)
     gaps, pressings = floats(contact.gaps, count), floats(contact.pressings, count)
-    restitutions, approaches = (
-        floats(contact.restitutions, count),
+    restitutions, rebounds = floats(contact.restitutions, count), floats(contact.rebounds, count)
+    approaches, force = (
         floats(contact.approaches, count),
+        floats(pointer_at(mj.efc_force), count),
     )
     mj_mul_jac(mj.model, mj.data, contact.pressings, contact.qacc_smooth)
-    force = floats(pointer_at(mj.efc_force), count)
     contact.blow_stage = contact.corrections = contact.cuts = 0
     for row in range(count):
         if rebounds[row] < 0.0:
             continue
-        impulses[row], pressings[row] = h * force[row], max(-pressings[row], 0.0)
-        way = rebound_speed(restitutions[row], approaches[row], gaps[row], pressings[row], h)
+        e, speed, free = restitutions[row], approaches[row], pressings[row]
+        impulses[row], pressings[row] = h * force[row], max(-free, 0.0)
+        allowed[row] = e * impulses[row] * speed / max(speed - h * free, BLOW_SPEED)
+        way = rebound_speed(e, speed, gaps[row], pressings[row], h)
         rebounds[row] = way if way > 0.0 else NO_REBOUND
         if way > 0.0:
             contact.blow_stage, contact.rebound_ratio = RESTITUTION, 1.0
@@ -729,7 +739,7 @@ def _begin_restitution(s: State) -> None:
 
 @compiled
 def _cut_rebounds(s: State) -> bool:
-    """Lowers rebounds whose impulse is beyond (1 + e) P_c; returns True if there were any.
+    """Lowers rebounds with an impulse beyond Poisson's; returns True if there were any.
 
     The impulse is P_c at ŵ = 0, and grows in proportion to ŵ while friction stays as it is.
     """
@@ -737,13 +747,12 @@ def _cut_rebounds(s: State) -> bool:
     if contact.cuts >= MAX_CORRECTIONS or contact.paid > 1.0:
         return False
     count = ints(s.mj.nefc, 1)[0]
-    impulses, rebounds = floats(contact.impulses, count), floats(contact.rebounds, count)
-    restitutions = floats(contact.restitutions, count)
-    force = floats(pointer_at(s.mj.efc_force), count)
+    impulses, allowed = floats(contact.impulses, count), floats(contact.returnable, count)
+    rebounds, force = floats(contact.rebounds, count), floats(pointer_at(s.mj.efc_force), count)
     for row in range(count):
-        beyond, returned = h * force[row] - impulses[row], restitutions[row] * impulses[row]
-        if rebounds[row] > 0.0 and beyond > (1.0 + REBOUND_ERROR) * returned:
-            rebounds[row] *= returned / beyond
+        beyond = h * force[row] - impulses[row]
+        if rebounds[row] > 0.0 and beyond > (1.0 + REBOUND_ERROR) * allowed[row]:
+            rebounds[row] *= allowed[row] / beyond
             is_any = True
     contact.cuts += is_any
     return is_any
