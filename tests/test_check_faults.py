@@ -842,3 +842,25 @@ def test_convex_pieces_open_the_hole_that_a_hull_fills(tmp_path: Path) -> None:
     assert depths[1] < 0.055
     mended = faults_in(tmp_path, text.format(f"{open_to_air}/>{boxes}"), down)
     assert "mesh not convex" not in kinds(mended)
+
+
+LEAPING = """<body name="pelvis" quat=".7071 .7071 0 0"><site name="a" pos="-.0655 .0138 -.0605"/>
+<geom name="brim" type="cylinder" size=".0549 .05" pos="-.071 -.065 -.0756"
+  quat=".8743 .1938 .0376 .4434"/>
+<body name="tool" pos="-.046 -.068 -.067"><joint type="slide" axis="1 0 0" damping="10"/>
+  <joint type="slide" axis="0 1 0" damping="10"/><joint type="slide" axis="0 0 1" damping="10"/>
+  <geom size=".01" mass=".1" contype="0" conaffinity="0"/><site name="grip"/>
+  <site name="b" pos=".002 -.054 .0057"/></body></body>"""
+
+
+@pytest.mark.parametrize(("geom", "is_told"), [('<geom geom="brim"/>', True), ("", False)])
+def test_energy_of_a_tendon_that_jumps_is_put_down_to_the_tendon(
+    tmp_path: Path, geom: str, is_told: bool
+) -> None:
+    path = f'<site site="a"/>{geom}<site site="b"/>'
+    cord = f'<tendon><spatial name="cord" stiffness="100">{path}</spatial></tendon>'
+    found = faults_in(tmp_path, mjcf(GOOD_OPTION, cord, body=LEAPING))
+    told = [fault for fault in found if fault.kind in CREATED]
+    assert bool(told) == is_told
+    for fault in told:
+        assert (fault.place.element, "damping" in fault.change) == ("tendon 'cord'", False)
