@@ -42,7 +42,7 @@ from hapticbridge.device import Motion
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.scene import compile_scene, read_scene, scene_names, scene_path
-from hapticbridge.scene.fault import Fault, length, weight
+from hapticbridge.scene.fault import Fault, length, number, weight
 from hapticbridge.scene.first_faults import worst_faults
 from hapticbridge.scene.physics import depth_under
 from hapticbridge.scene.source_map import Place
@@ -560,6 +560,24 @@ def test_what_a_servo_carries_the_hand_does_not(tmp_path: Path, gain: float, is_
     if told:  # the moment about the hinge: m g r = (K r² + K_r + k) sag / r
         sag = 0.8 * 9.81 * 0.05**2 / (2400 * 0.05**2 + 2.4 + gain)
         assert length(sag) in told[0].sentence
+
+
+@pytest.mark.parametrize(("active", "mass"), [("true", 0.55), ("false", None)])
+@pytest.mark.parametrize("tie", ['<weld body1="tool" body2="load" {}/>',
+    '<connect body1="tool" body2="load" anchor="0 0 -.05" {}/>'])  # fmt: skip
+def test_what_is_tied_to_the_tool_hangs_in_the_hand(
+    tmp_path: Path, tie: str, active: str, mass: float | None
+) -> None:
+    body = """<body name="tool"><joint type="slide" axis="0 0 1"/><geom size="0.01" mass="0.05"/>
+      <site name="grip"/></body><body name="load" pos="0 0 -.1"><freejoint/>
+      <geom size="0.01" mass="0.5"/></body>"""
+    tied = "<equality>" + tie.format(f'active="{active}"') + "</equality>"
+    found = faults_in(tmp_path, mjcf(HEAVY, GOOD_CONTACT, tied, body=body))
+    told = [fault.sentence for fault in found if fault.kind == "heavy tool"]
+    assert len(told) == (mass is not None)
+    if mass is not None:
+        words = weight(mass), number(mass * 9.81), length(mass * 9.81 / 2400)
+        assert all(each in told[0] for each in words)
 
 
 TWO_KINDS = """<geom name="wall" type="box" size="0.01 0.1 0.1" pos="0.06 0 0" {wall}/>
