@@ -42,7 +42,7 @@ from hapticbridge.device import Motion
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.scene import compile_scene, read_scene, scene_names, scene_path
-from hapticbridge.scene.fault import Fault, length, weight
+from hapticbridge.scene.fault import Fault, length, number, weight
 from hapticbridge.scene.first_faults import worst_faults
 from hapticbridge.scene.physics import depth_under
 from hapticbridge.scene.source_map import Place
@@ -562,6 +562,24 @@ def test_what_a_servo_carries_the_hand_does_not(tmp_path: Path, gain: float, is_
         assert length(sag) in told[0].sentence
 
 
+@pytest.mark.parametrize(("active", "mass"), [("true", 0.55), ("false", None)])
+@pytest.mark.parametrize("tie", ['<weld body1="tool" body2="load" {}/>',
+    '<connect body1="tool" body2="load" anchor="0 0 -.05" {}/>'])  # fmt: skip
+def test_what_is_tied_to_the_tool_hangs_in_the_hand(
+    tmp_path: Path, tie: str, active: str, mass: float | None
+) -> None:
+    body = """<body name="tool"><joint type="slide" axis="0 0 1"/><geom size="0.01" mass="0.05"/>
+      <site name="grip"/></body><body name="load" pos="0 0 -.1"><freejoint/>
+      <geom size="0.01" mass="0.5"/></body>"""
+    tied = "<equality>" + tie.format(f'active="{active}"') + "</equality>"
+    found = faults_in(tmp_path, mjcf(HEAVY, GOOD_CONTACT, tied, body=body))
+    told = [fault.sentence for fault in found if fault.kind == "heavy tool"]
+    assert len(told) == (mass is not None)
+    if mass is not None:
+        words = weight(mass), number(mass * 9.81), length(mass * 9.81 / 2400)
+        assert all(each in told[0] for each in words)
+
+
 TWO_KINDS = """<geom name="wall" type="box" size="0.01 0.1 0.1" pos="0.06 0 0" {wall}/>
 <body name="tool"><freejoint/><site name="grip"/>
   <geom name="shell" type="box" size="0.02 0.02 0.02" mass="0.05" {shell}/>
@@ -829,6 +847,8 @@ def test_convex_pieces_open_the_hole_that_a_hull_fills(tmp_path: Path) -> None:
     fault = one_of("mesh not convex", faults_in(tmp_path, text.format("/>"), down))
     open_to_air = 'contype="0" conaffinity="0"'
     assert open_to_air in fault.change
+    # the middle of a wall's edge is 25 mm from the hull's faces, the centres of triangles less
+    assert "deep or deeper" in fault.sentence
     scene, motion = tmp_path / "tube.xml", tmp_path / "down.csv"
     motion.write_text(down)
     depths = []
@@ -842,3 +862,41 @@ def test_convex_pieces_open_the_hole_that_a_hull_fills(tmp_path: Path) -> None:
     assert depths[1] < 0.055
     mended = faults_in(tmp_path, text.format(f"{open_to_air}/>{boxes}"), down)
     assert "mesh not convex" not in kinds(mended)
+
+
+LEAPING = """<body name="pelvis" quat=".7071 .7071 0 0"><site name="a" pos="-.0655 .0138 -.0605"/>
+<geom name="brim" type="cylinder" size=".0549 .05" pos="-.071 -.065 -.0756"
+  quat=".8743 .1938 .0376 .4434"/>
+<body name="tool" pos="-.046 -.068 -.067"><joint type="slide" axis="1 0 0" damping="10"/>
+  <joint type="slide" axis="0 1 0" damping="10"/><joint type="slide" axis="0 0 1" damping="10"/>
+  <geom size=".01" mass=".1" contype="0" conaffinity="0"/><site name="grip"/>
+  <site name="b" pos=".002 -.054 .0057"/></body></body>"""
+
+
+@pytest.mark.parametrize(("geom", "is_told"), [('<geom geom="brim"/>', True), ("", False)])
+def test_energy_of_a_tendon_that_jumps_is_put_down_to_the_tendon(
+    tmp_path: Path, geom: str, is_told: bool
+) -> None:
+    path = f'<site site="a"/>{geom}<site site="b"/>'
+    cord = f'<tendon><spatial name="cord" stiffness="100">{path}</spatial></tendon>'
+    found = faults_in(tmp_path, mjcf(GOOD_OPTION, cord, body=LEAPING))
+    told = [fault for fault in found if fault.kind in CREATED]
+    assert bool(told) == is_told
+    for fault in told:
+        assert (fault.place.element, "damping" in fault.change) == ("tendon 'cord'", False)
+
+
+ARM_WITH_SENSORS = """<body name="arm"><joint type="slide" axis="0 0 1"/><site name="wrist"/>
+  <geom size="0.01" mass="0.05" {off}/><body name="hand" pos="0 0 -.1"><site name="grip"/>
+    <geom size="0.01" mass="0.02" {off}/></body>
+  <body name="finger" pos=".1 0 0"><joint axis="0 1 0" damping="1"/><site name="pad"/>
+    <geom size="0.01" mass="0.02" {off}/></body></body>"""
+
+
+def test_sensor_that_carries_the_grip_is_told_to_read_the_coupling(tmp_path: Path) -> None:
+    sensors = """<sensor><force name="at wrist" site="wrist"/><torque name="too" site="wrist"/>
+      <force name="at pad" site="pad"/><framepos objtype="site" objname="wrist"/></sensor>"""
+    body = ARM_WITH_SENSORS.format(off='contype="0" conaffinity="0"')
+    text = mjcf(GOOD_OPTION, GOOD_CONTACT, sensors, body=body)
+    told = [fault for fault in faults_in(tmp_path, text) if fault.kind == "force sensor"]
+    assert [fault.place.element for fault in told] == ["force 'at wrist'", "torque 'too'"]

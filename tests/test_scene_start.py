@@ -49,6 +49,11 @@ GEARED = scene_text(
 WELDED = scene_text(
     PART, '<equality><weld name="hold" body1="part" relpose="0 0 .05 1 0 0 0"/></equality>'
 )
+TURNED = scene_text(  # by 30 deg about z, whatever its torquescale; and by 3, 4 and 12 cm
+    PART.replace("</body>", '<site name="b" pos=".03 .04 .12" euler="0 0 30"/></body>')
+    + '<site name="a" pos="0 0 .1"/>',
+    '<equality><weld site1="a" site2="b" torquescale=".2"/></equality>',
+)
 PINNED = scene_text(
     PART, '<equality><connect body1="part" body2="tool" anchor="0 0 .2"/></equality>'
     '<keyframe><key name="home" qpos=".5 0 .1 1 0 0 0 0 .1 .1 1 0 0 0"/></keyframe>',
@@ -73,6 +78,11 @@ CASES = {
     WELDED: [
         "start of weld 'hold' of body 'part': 150 mm off → closed",
         "start of body 'part': moved by 150 mm",
+    ],
+    TURNED: [
+        "start of weld of site 'a' and 'b': 130 mm off → closed",
+        "start of weld of site 'a' and 'b': 30 deg off → closed",
+        "start of body 'part': moved by 130 mm, turned by 30 deg",
     ],
     PINNED: [
         "start of connect of body 'part' and 'tool': 100 mm off → closed",

@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 
+import mujoco
+
 from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.constraint_faults import constraint_faults
 from hapticbridge.check.contact_faults import (
@@ -18,6 +20,7 @@ from hapticbridge.check.geometry_faults import grip_faults, mesh_faults, workspa
 from hapticbridge.check.mass_faults import mass_faults
 from hapticbridge.check.run_faults import run_faults
 from hapticbridge.errors import choices
+from hapticbridge.kernel.codes import held_body
 from hapticbridge.run.fidelity import fidelity
 from hapticbridge.scene import compile_scene
 from hapticbridge.scene.checks import MAY_BE_ACTIVE, first_pump, unmetered_work
@@ -119,12 +122,42 @@ def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         )
 
 
+def sensor_faults(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Yields force and torque sensors between the grip and the world.
+
+    MuJoCo computes them from motion, weight, contacts and equalities. It counts actuators, of which
+    the coupling is made, as motors of the joints, whose pull passes the sensor.
+    """
+    model, body = case.model, held_body(case.model, case.scene.grip)
+    carriers = {body}
+    while body:
+        body = int(model.body_parentid[body])
+        carriers.add(body)
+    for sensor in range(model.nsensor):
+        is_force = int(model.sensor_type[sensor]) in (
+            int(mujoco.mjtSensor.mjSENS_FORCE),
+            int(mujoco.mjtSensor.mjSENS_TORQUE),
+        )
+        if not is_force or int(model.site_bodyid[model.sensor_objid[sensor]]) not in carriers:
+            continue
+        name = str(model.sensor(sensor).name)
+        tag = "force" if model.sensor_type[sensor] == mujoco.mjtSensor.mjSENS_FORCE else "torque"
+        yield Fault(
+            "force sensor",
+            case.places.named(tag, name),
+            f"sensor '{name or sensor}' carries the grip: its readings include the coupling's pull "
+            "on the tool, which MuJoCo takes for a motor's, and a real sensor there would not",
+            "nothing; subtract the wrench on the tool, about its site and along its axes",
+        )
+
+
 # Rules by which a scene is judged
 
 RULES = (
     option_faults,
     own_motion_faults,
     keyframe_faults,
+    sensor_faults,
     mass_faults,
     unit_faults,
     pump_faults,

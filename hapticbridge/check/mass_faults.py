@@ -7,9 +7,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.check.case import STAND_IN_INERTIA, STAND_IN_MASS, SceneUnderCheck
+from hapticbridge.kernel.codes import held_body
 from hapticbridge.scene.fault import Fault, length, number, others, weight
+from hapticbridge.scene.handle import tied_trees
 from hapticbridge.scene.physics import (
     body_inertia,
 )
@@ -148,11 +151,18 @@ def _load_ratios(case: SceneUnderCheck) -> Iterator[Fault]:
 
 
 def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Computes the tool's sag below the handle: (JᵀKJ + K_joints + K_servos) δq = its weight."""
+    """Computes the tool's sag below the handle: (JᵀKJ + K_joints + K_servos) δq = the weight.
+
+    Bodies of other trees that active welds and connects tie to the tool hang on it: A δq = 0 with
+    the Jacobian A of these equalities.
+    """
     model, scene = case.model, case.scene
     scene.reset()
     data, site = scene.data, model.site(scene.grip).id
-    dofs = np.flatnonzero(case.tool_bodies[model.dof_bodyid])
+    own = int(model.body_treeid[held_body(model, scene.grip)])
+    tied = [tree for tree in tied_trees(model, own) if tree != own]
+    bodies = case.tool_bodies | np.isin(model.body_treeid, tied)
+    dofs = np.flatnonzero(bodies[model.dof_bodyid])
     jacobian = np.zeros((6, model.nv))
     mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], site)
     coupling = case.coupling
@@ -172,18 +182,38 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     tool_jacobian = jacobian[:, dofs]
     stiffness = tool_jacobian.T @ (gains[:, None] * tool_jacobian) + np.diag(springs[dofs])
     pulls = (data.qfrc_gravcomp - bias)[dofs]
-    moved = np.linalg.lstsq(stiffness, pulls, rcond=1e-9)[0]
+    free = _unconstrained(model, data, dofs) if tied else np.eye(dofs.size)
+    moved = free @ np.linalg.lstsq(free.T @ stiffness @ free, free.T @ pulls, rcond=1e-9)[0]
     sag = float(np.linalg.norm(tool_jacobian[:3] @ moved))
     if sag <= MAX_SAG:
         return
     of_tool = np.flatnonzero(case.tool_bodies)
-    mass = float(model.body_mass[of_tool].sum())
+    mass = float(model.body_mass[bodies].sum())
+    what, where = "the tool", "the body and those below it"
+    if tied:
+        what, where = "the tool, with what is tied to it,", f"{where}, and in those tied to it"
     pull = sag * coupling.stiffness
     yield Fault(
         "heavy tool",
         case.places.body(int(of_tool[0])),  # the first that moves
-        f"the tool weighs {weight(mass)}; the part the hand carries, {number(pull)} N, stretches "
+        f"{what} weighs {weight(mass)}; the part the hand carries, {number(pull)} N, stretches "
         f"the coupling of {coupling.stiffness:.4g} N/m by {length(sag)} at rest; a run carries "
         "it where the device cannot, and with --no-tool-weight",
-        'gravcomp="1" in the body and those below it, or less mass',
+        f'gravcomp="1" in {where}, or less mass',
     )
+
+
+def _unconstrained(
+    model: mujoco.MjModel, data: mujoco.MjData, dofs: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Returns directions (n, m) of the dofs that satisfy all equalities of the start."""
+    mujoco.mj_fwdPosition(model, data)
+    rows = np.zeros((data.nefc, model.nv))
+    for row in range(data.nefc):
+        unit = np.zeros(data.nefc)
+        unit[row] = 1.0
+        mujoco.mj_mulJacTVec(model, data, rows[row], unit)
+    is_equality = data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+    _, sizes, axes = np.linalg.svd(rows[is_equality][:, dofs])
+    rank = int(np.sum(sizes > 1e-9 * sizes.max(initial=0.0)))
+    return np.asarray(axes[rank:].T)

@@ -253,6 +253,11 @@ MAX_WORK, MIN_TICKS = 2e6, 500
 and the ticks that it always takes. A unit costs 3 to 7 µs. A scene of 400 is observed for 5 s, a
 heavier one for less."""
 
+JUMP = 1e-4
+"""Change in m of a tendon's length in a tick, beyond that of its speed, from which on it counts as
+a jump. A tendon that leaves a geom which it wraps jumps by mm; a smaller value would tell rounding
+of a blow's tick."""
+
 PROGRESS_EVERY = 500
 """Ticks between two calls of ``progress``."""
 
@@ -293,6 +298,7 @@ class Observation:
         warnings: Number of MuJoCo's warnings by text.
         environment: ``strict``, ``within slack`` or ``active``.
         slack_share: Largest share of the slack that was used, without unit.
+        jumps: Largest jump in m of each tendon that jumped, by id.
     """
 
     meetings: dict[tuple[int, int], Meeting]
@@ -304,6 +310,7 @@ class Observation:
     warnings: dict[str, int] = field(default_factory=dict)
     environment: str = "strict"
     slack_share: float = 0.0
+    jumps: dict[int, float] = field(default_factory=dict)
 
 
 def observe(
@@ -329,6 +336,7 @@ def observe(
     types = np.zeros((samples.size, len(_TYPE.__members__)), np.int64)
     postures, every = [], max(samples.size // POSTURES, 1)
     force, full, work, done = np.zeros(samples.size), 0, 0, samples.size
+    jumps, tendons = dict[int, float](), (data.ten_length.copy(), data.ten_velocity.copy())
     for k in range(samples.size):
         if work > MAX_WORK and k >= MIN_TICKS:
             done = k
@@ -344,6 +352,11 @@ def observe(
             types[k, : counted.size] = counted
         if data.ncon:
             _note_contacts(data, model.opt.timestep, meetings, setting.contact == RIGID)
+        if model.ntendon:
+            now = data.ten_length.copy(), data.ten_velocity.copy()
+            if k:
+                _note_jumps(tendons, now, period, jumps)
+            tendons = now
         iterations = data.solver_niter[: max(data.nisland, 1)]
         full += bool(data.nefc) and bool(iterations.max(initial=0) >= model.opt.iterations)
         force[k] = float(np.linalg.norm(row["wrench_on_tool"][0, :3]))
@@ -362,7 +375,23 @@ def observe(
         warnings=_warnings(data),
         environment=ledger.environment,
         slack_share=ledger.slack_share,
+        jumps=jumps,
     )
+
+
+_Tendons = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def _note_jumps(before: _Tendons, now: _Tendons, period: float, jumps: dict[int, float]) -> None:
+    """Adds the tendons whose length changed by more than their speed, before or now, accounts for.
+
+    A length L of a smooth path changes by |ΔL| <= T max |L̇| in a period T. The factor of two leaves
+    room for speeds within the steps of a tick.
+    """
+    speed = np.maximum(np.abs(before[1]), np.abs(now[1]))
+    beyond = np.abs(now[0] - before[0]) - 2.0 * period * speed
+    for tendon in np.flatnonzero(beyond > JUMP).tolist():
+        jumps[tendon] = max(jumps.get(tendon, 0.0), float(beyond[tendon]))
 
 
 def _note_contacts(

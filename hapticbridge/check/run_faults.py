@@ -11,7 +11,7 @@ from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.observe import Observation
 from hapticbridge.scene.checks import unmetered_work
 from hapticbridge.scene.contacts import suggested_solref
-from hapticbridge.scene.fault import Fault, number
+from hapticbridge.scene.fault import Fault, length, number
 
 ITERATIONS = 100
 """MuJoCo's default limit of solver iterations. Newton's solver takes 1 to 8 in the shipped
@@ -100,6 +100,8 @@ def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:
             f"{number(100 * seen.slack_share)} % of the coupling's slack, which covers it",
         )
     )
+    if seen.jumps:
+        return _created_by_jump(case, seen, kind, used)
     sentence = (
         f"contacts or joints created energy in the motion: {used}; a hand that yields, as in a "
         "run, may see less"
@@ -114,6 +116,19 @@ def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:
         f"{sentence}; the largest force was between {one.element} and {other.element}",
         f"{suggested_solref(case.step)} there and at {other.file}:"
         f"{other.line}, {other.element} (four times softer, and slow to come back), or more mass",
+    )
+
+
+def _created_by_jump(case: SceneUnderCheck, seen: Observation, kind: str, used: str) -> Fault:
+    """Names the tendon with the largest jump: what stretches it at once does no work for that."""
+    tendon = max(seen.jumps, key=lambda each: seen.jumps[each])
+    place = case.places.tendon(tendon)
+    return Fault(
+        kind,
+        place,
+        f"{place.element} jumped by {length(seen.jumps[tendon])} in one tick of the motion, as its "
+        f"way round a geom changed, and energy was created: {used}",
+        'a sidesite="…" at the geom that it wraps, or a geom that it never leaves or never meets',
     )
 
 

@@ -8,6 +8,8 @@ its energy into the hand. The start is therefore moved onto the constraints befo
 from __future__ import annotations
 
 import copy
+import math
+from collections import defaultdict
 from typing import NamedTuple
 
 import mujoco
@@ -46,6 +48,7 @@ _KINDS = {
     int(mujoco.mjtEq.mjEQ_JOINT): "joint equality",
     int(mujoco.mjtEq.mjEQ_TENDON): "tendon equality",
 }
+_POINTS = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
 _HINGES = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL)
 
 
@@ -125,7 +128,11 @@ def _projected(trial: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64
         data.qpos[:] = start
         _clamp_joints(trial, data)
         sizes = _approach(trial, data)
-        still = [row[1] for row, size in sizes.items() if row[0] == "equality" and size > VIOLATION]
+        still = [
+            number
+            for (kind, number), size in sizes.items()
+            if kind in ("equality", "turn") and size > VIOLATION
+        ]
         if not still:
             break
         data.eq_active[still] = 0
@@ -224,23 +231,36 @@ def constraint_name(model: mujoco.MjModel, data: mujoco.MjData, row: int) -> str
 
 
 def _violations(model: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, int], float]:
-    """Returns the largest violation in m or rad of each limit and equality constraint."""
+    """Returns the violation in m or rad of each limit and equality constraint.
+
+    A weld has two, ``equality`` in m and ``turn`` in rad: MuJoCo's last three rows of it are s sin
+    (θ/2) along the axis of the turn θ, with its torquescale s in m.
+    """
     sizes: dict[tuple[str, int], float] = {}
+    vectors: defaultdict[int, list[float]] = defaultdict(list)
     distances = data.efc_pos - data.efc_margin
     for kind, number, distance in zip(data.efc_type, data.efc_id, distances, strict=True):
         row = _ROWS.get(int(kind), ""), int(number)
         is_equality = row[0] == "equality"
         if not row[0] or (is_equality and int(model.eq_type[number]) not in _KINDS):
             continue
+        if is_equality and int(model.eq_type[number]) in _POINTS:
+            vectors[row[1]].append(float(distance))
+            continue
         size = abs(float(distance)) if is_equality else max(-float(distance), 0.0)
         sizes[row] = max(sizes.get(row, 0.0), size)
+    for number, parts in vectors.items():
+        sizes["equality", number] = math.hypot(*parts[:3])
+        scale = float(model.eq_data[number, 10])
+        if parts[3:] and scale > 0.0:
+            sizes["turn", number] = 2.0 * math.asin(min(math.hypot(*parts[3:]) / scale, 1.0))
     return sizes
 
 
 def row_name(model: mujoco.MjModel, row: tuple[str, int]) -> str:
     """Returns the name of a constraint, given as its kind in ``_ROWS`` and its number."""
     kind, number = row
-    if kind != "equality":
+    if kind not in ("equality", "turn"):
         return f"{kind} '{getattr(model, kind)(number).name or number}'"
     if int(model.eq_type[number]) not in _KINDS:  # of a flex
         return f"equality '{model.equality(number).name or number}'"
@@ -266,8 +286,8 @@ def _off(model: mujoco.MjModel, row: tuple[str, int], size: float) -> str:
         first = int(model.tendon_adr[number])
         is_fixed = int(model.wrap_type[first]) == int(mujoco.mjtWrap.mjWRAP_JOINT)
         kind, number = ("joint", int(model.wrap_objid[first])) if is_fixed else ("", 0)
-    is_angle = kind == "joint" and int(model.jnt_type[number]) in _HINGES
-    beyond = "off" if row[0] == "equality" else "beyond its limit"
+    is_angle = kind == "turn" or (kind == "joint" and int(model.jnt_type[number]) in _HINGES)
+    beyond = "off" if row[0] in ("equality", "turn") else "beyond its limit"
     return f"{_place(size, is_angle=is_angle)} {beyond}"
 
 
