@@ -164,7 +164,8 @@ def test_a_rebound_that_the_blow_pays_for_in_part_loses_little(drop: float, spee
 def test_a_ball_that_is_pulled_away_leaves_with_e_of_its_speed() -> None:
     e = e_of(0.1)
     run = started(
-        scene(BALL.format(height=RADIUS + 0.0025), 0.1, -80.0), {"ball": (0, 0, -1, 0, 0, 0)}
+        scene(BALL.format(height=RADIUS + 0.0025), 0.1, -80.0),
+        {"ball": np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0])},
     )
     speeds = resting(run, 0.006, lambda d: d.joint("ball").qvel[2])
     blow = int(np.flatnonzero(np.diff(speeds) > 0.5)[0])

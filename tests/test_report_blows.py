@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +104,19 @@ def test_the_summary_has_what_blows_paid_and_what_pulses_did(
     gave = f"blows gave them {format_energy(paid)}, the hand gave them {format_energy(-worked)}"
     assert gave in str(summary)
     assert balance_words(2.0, 1.0, 0).endswith("gave them 2 J, they gave the hand 1 J")
+
+
+def test_a_blow_of_two_ticks_has_the_e_of_the_faster_one(run: Recording) -> None:
+    evidence = Evidence.of(run)
+    assert evidence is not None
+    ticks = evidence.ticks.copy()
+    ticks["blow_energy"] = 0.0
+    for tick, speed, rebound in ((30, 0.08, 0.0), (31, 0.14, 0.8)):
+        ticks["blow_energy"][tick], ticks["blow_restitution"][tick] = 1e-3, 0.8
+        ticks["blow_speed"][tick], ticks["blow_rebound"][tick] = speed, rebound
+    (blow,) = blows_of(replace(evidence, recording=replace(run, ticks=ticks)))
+    assert (blow.speed, blow.had) == pytest.approx((0.14, 0.8))
+    assert blow.returned == pytest.approx(2e-3 * 0.64 / 0.36)
 
 
 def test_a_pulse_that_ends_early_is_told_with_its_cause(tmp_path: Path) -> None:

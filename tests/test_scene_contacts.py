@@ -15,7 +15,7 @@ from outside_scenes import scene_file
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import prepare
-from hapticbridge.errors import SceneError
+from hapticbridge.errors import SceneError, SceneWarning
 from hapticbridge.kernel.jit import source_of
 from hapticbridge.kernel.restitution import restitution
 from hapticbridge.lab.methods import METHODS
@@ -406,3 +406,19 @@ def test_a_bounce_is_said_with_its_coefficient(tmp_path: Path, setting: str, sai
     assert more == ([f"{said} (--contact scene keeps it)"] if said else [])
     scene.set_contact(is_rigid=False)
     assert scene.changes == before
+
+
+@pytest.mark.parametrize("mixed", ["0.02 0", "0.02 -10", "-5000 1", "0 1"])
+def test_a_solref_of_two_forms_counts_as_mujocos_default_and_is_told(
+    tmp_path: Path, mixed: str
+) -> None:
+    first, second = map(float, mixed.split())
+    solimp = contacts.MUJOCO_SOLIMP
+    of_default = contacts.contact_numbers(contacts.MUJOCO_SOLREF, solimp, 1e-3)
+    assert contacts.contact_numbers((first, second), solimp, 1e-3) == of_default
+    path = tmp_path / "mixed.xml"
+    path.write_text(BOUNCER.format(f'solref="{mixed}"'))
+    with pytest.warns(
+        SceneWarning, match=f"solref {mixed} of geom 'ball' mixes MuJoCo's two forms"
+    ):
+        load_scene(path)

@@ -424,6 +424,12 @@ def test_a_setting_may_have_the_dashes_of_its_flag() -> None:
     ]
 
 
+def test_a_pulse_of_numbers_is_one_value() -> None:
+    assert changes_from(["pulse=200,20"]) == [{"pulse": "200,20"}]
+    assert changes_from(["pulse=200,20,90,8"]) == [{"pulse": "200,20"}, {"pulse": "90,8"}]
+    assert changes_from(["pulse=steel,wood"]) == [{"pulse": "steel"}, {"pulse": "wood"}]
+
+
 def test_several_values_of_a_setting_stand_side_by_side(wall: Path, call: Called) -> None:
     asked = ("audit", wall, "--in-process", "--what-if", "stiffness=500,900")
     code, out, _ = call(*asked, "--what-if", "damping=0.7")

@@ -13,6 +13,7 @@ from hapticbridge.kernel.colliders import MAX_VERTICES
 from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION, REFUSED_PENETRATION
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.contacts import (
+    MUJOCO_SOLREF,
     REFERENCE_STEPS,
     ROUNDING,
     SOFT_STEPS,
@@ -31,9 +32,6 @@ from hapticbridge.scene.source_map import Place
 MIN_PUSH = 1.0
 """Smallest force in N that contacts are tested with: a light touch. A motion without contact does
 not stretch the coupling, so it gives no test force."""
-
-MUJOCO_SOLREF = (0.02, 1.0)
-"""Default ``solref`` of a MuJoCo geom."""
 
 _MIN_FRICTION = float(mujoco.mjMINMU)
 _TYPICAL_INERTIA = 0.1  # kg; for pairs of which neither side moves by itself

@@ -22,6 +22,7 @@ from hapticbridge.kernel.codes import RAMPING
 from hapticbridge.kernel.impact_pulse import ENDS, FADED
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import due_times
+from hapticbridge.kernel.restitution import MAX_RESTITUTION
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.run.description import method_of, parameters_of, requested_of
@@ -212,7 +213,8 @@ class Blow:
     Attributes:
         time: Due time of its first tick in s.
         tick: Number of this tick.
-        speed: Normal speed of the contact in m/s, of the largest if there are several.
+        speed: Largest normal speed of its contact at the start of a tick in m/s, of the largest
+            blow if there are several.
         asked: Coefficient of restitution e that the contact asks for.
         had: e that it had.
         burned: Energy W in J that it took from the bodies.
@@ -234,7 +236,7 @@ class Blow:
     @property
     def returned(self) -> float:
         """Energy in J that it gave back, as one contact with its e does: W e²/(1 − e²)."""
-        return self.burned * self.had**2 / max(1.0 - self.had**2, 1e-9)
+        return self.burned * self.had**2 / (1.0 - min(self.had, MAX_RESTITUTION) ** 2)
 
 
 def blows_of(evidence: Evidence) -> list[Blow]:
@@ -254,7 +256,7 @@ def blows_of(evidence: Evidence) -> list[Blow]:
     found = []
     for group, end in zip(groups, ends, strict=True):
         rows, last = ticks[group], ticks[group[-1]]
-        speed, given = float(rows["blow_speed"][0]), float(paid[group].sum())
+        speed, given = float(rows["blow_speed"].max()), float(paid[group].sum())
         after = stops[group[-1] + 1 : min(group[-1] + 1 + life, end)]
         found.append(
             Blow(

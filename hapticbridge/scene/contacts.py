@@ -84,6 +84,9 @@ REFERENCE_STEPS = 2.0
 SUGGESTED = (0.5, 8.0)
 """timeconst/h and dampratio of the least damped strict setting: τ = 60.8 h, κ = 0.57."""
 
+MUJOCO_SOLREF = (0.02, 1.0)
+"""MuJoCo's default ``solref``, which it also takes for two numbers of which one alone is > 0."""
+
 MUJOCO_SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 """MuJoCo's defaults for missing values of a ``solimp``: d₀, d_w, width in m, midpoint, power."""
 
@@ -159,8 +162,9 @@ def contact_numbers(
             "needs two numbers in solref, at least one in solimp and a time step > 0, all finite"
         )
     impedance, last = impedance_at(solimp, SHALLOW), impedance_at(solimp, math.inf)
-    first, second = float(solref[0]), float(solref[1])
-    if first > 0 and second > 0:
+    is_mixed = (solref[0] > 0) != (solref[1] > 0)
+    first, second = MUJOCO_SOLREF if is_mixed else (float(solref[0]), float(solref[1]))
+    if first > 0:
         resolved, ratio = first * second / timestep, second
     else:
         stiffness, damping = max(-first, 0.0), max(-second, 0.0)

@@ -50,6 +50,7 @@ from hapticbridge.scene.handle import (
 )
 from hapticbridge.scene.parameters import apply_parameters
 from hapticbridge.scene.scene import Scene
+from hapticbridge.scene.softness import mixed_forms
 from hapticbridge.scene.source import SourceFile, collect_sources, with_assets
 from hapticbridge.scene.start import start_on_constraints
 from hapticbridge.scene.treatment import SceneChange
@@ -394,7 +395,7 @@ def compile_scene(
         if not as_is and (excluded := exclude_nested(spec, model, grips[0])):
             changes, model = changes + excluded, spec.compile()
         concerns = [each + MAY_BE_ACTIVE for each in unmetered_work(model).values()]
-        concerns += about_grip
+        concerns += [*mixed_forms(model), *about_grip]
         held = list[str]()
         for each in dict.fromkeys(grips):
             check_model(model, each)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.kernel.jit import source_of
 from hapticbridge.kernel.restitution import rigid_restitution
-from hapticbridge.scene.contacts import contact_numbers
+from hapticbridge.scene.contacts import MUJOCO_SOLREF, contact_numbers
 from hapticbridge.scene.treatment import SceneChange
 from hapticbridge.units import format_si
 
@@ -119,6 +119,20 @@ def _softened(springs: Sequence[_Springs]) -> Iterator[SceneChange]:
         if named := _first(each, frequency < SOFT_FREQUENCY):
             words = f"{named}: a spring of {frequency.min():.2g} Hz → rigid"
             yield SceneChange(words, each.subject)
+
+
+def mixed_forms(model: mujoco.MjModel) -> Iterator[str]:
+    """Yields the constraints whose ``solref`` MuJoCo replaces, as one number alone is > 0."""
+    usual = " ".join(f"{value:g}" for value in MUJOCO_SOLREF)
+    for each in _springs(model):
+        is_positive = each.solref > 0.0
+        is_mixed = is_positive[:, 0] != is_positive[:, 1]
+        if named := _first(each, is_mixed):
+            first, second = each.solref[np.argmax(is_mixed)].tolist()
+            yield (
+                f"solref {first:g} {second:g} of {named} mixes MuJoCo's two forms, so its default "
+                f"{usual} counts; write two positive numbers or two that are not"
+            )
 
 
 def bounces(model: mujoco.MjModel) -> tuple[Bounce, ...]:

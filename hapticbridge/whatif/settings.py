@@ -228,7 +228,8 @@ def changes_from(words: Iterable[str]) -> list[dict[str, Value]]:
                 f"cannot change '{word:.80}'; write a name and a value, such as stiffness=3000; "
                 f"names: {choices(CHANGEABLE)}, and the scene's parameters"
             )
-        values.setdefault(_plain_name(name), []).extend(part.strip() for part in text.split(","))
+        name = _plain_name(name)
+        values.setdefault(name, []).extend(_values(name, text))
     several = [name for name, each in values.items() if len(each) > 1]
     if len(several) > 1:
         raise RecordingError(
@@ -239,6 +240,14 @@ def changes_from(words: Iterable[str]) -> list[dict[str, Value]]:
         {name: each[index if len(each) > 1 else 0] for name, each in values.items()}
         for index in range(count)
     ]
+
+
+def _values(name: str, text: str) -> list[str]:
+    """Returns the values that a text has between commas; a pulse of numbers, HZ,MS, is one."""
+    parts = [part.strip() for part in text.split(",")]
+    if name == "pulse" and not any(part.isalpha() for part in parts):
+        parts = [",".join(parts[i : i + 2]) for i in range(0, len(parts), 2)]
+    return parts
 
 
 def _plain_name(name: str) -> str:
