@@ -383,10 +383,10 @@ class RunParameters(StepTimes):
 
     def _check_pulses(self) -> None:
         for is_so, reason in (
-            (not self.is_rigid, "contact is 'scene'; pulses need rigid contact"),
+            (not self.is_rigid, "contacts are the scene's own; pulses need rigid ones"),
             (not self.has_law, "the method has none; pulses need a coupling law"),
-            (self.is_joint, "the hand holds a joint; pulses need a tool that is held at a site"),
-            (self.scene_ticks, "scene-rate is below the rate; pulses need a step in every tick"),
+            (self.is_joint, "the hand holds a joint; pulses need a site or a body"),
+            (self.scene_ticks, "the scene steps in some ticks alone; pulses need all"),
             (self.is_apart, "the device has a loop of its own; pulses need the bridge's"),
         ):
             if is_so:
