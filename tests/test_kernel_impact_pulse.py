@@ -405,7 +405,7 @@ def test_a_pulse_may_act_a_tick_later_on_a_real_device(is_real: bool, ticks: int
     ("options", "message"),
     [
         ({"contact": "scene"}, r"impact-pulses is 0\.5, but contacts are the scene's own"),
-        ({"scene_rate": 100.0}, "a step in every tick"),
+        ({"scene_rate": 100.0}, "the scene steps in some ticks alone; pulses need all"),
         ({"rate": 500.0, "pulse": "300,5"}, "at most 250 Hz, half the rate"),
     ],
 )
