@@ -21,6 +21,7 @@ from hapticbridge.dataclass_json import from_json, to_json
 from hapticbridge.demand.guard import Limits
 from hapticbridge.device import GrippingDevice
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.kernel.record import FORMAT
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.hands import Grasp, GripAxis
@@ -193,6 +194,11 @@ def test_the_runs_choose_a_value_for_every_field(tmp_path: Path) -> None:
 def test_other_fields_of_a_recording_need_another_format() -> None:
     """A changed field fails here until ``kernel.record.FORMAT`` is the next; then freeze."""
     assert golden.format_fields() == golden.FORMAT_FIELDS.read_text(encoding="utf-8")
+
+
+def test_the_changelog_names_the_format_of_recordings() -> None:
+    changelog = Path(__file__).parents[1] / ".github" / "CHANGELOG.md"
+    assert f"- **Recordings** have format {FORMAT}." in changelog.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", RUNS)
