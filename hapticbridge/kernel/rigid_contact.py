@@ -586,7 +586,7 @@ def _aim_rows(s: State) -> None:
         if kind == EQUALITY and has_moved:
             wanted -= (1.0 - contact.push_ratio) * (own[row] - before[row]) / h
         wanted -= shifts[row]
-        rebound = _rebound(s, row) if kind != EQUALITY else -1.0
+        rebound = _rebound(s, row) if kind != EQUALITY else NO_REBOUND
         if rebound >= 0.0:
             wanted = max(wanted, _softened(rebound, velocities[row]))
         positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
