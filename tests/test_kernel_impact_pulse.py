@@ -172,6 +172,26 @@ def test_blows_in_each_substep_are_noted(method: str, substeps: int, tmp_path: P
     assert audit(path).resimulation == "bit for bit"
 
 
+@pytest.mark.parametrize("pulse", ["steel", "rubber"])
+def test_a_part_on_a_joint_gives_a_pulse_along_the_grip_s_own_way(
+    pulse: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "ratchet.mcap"
+    recorded(path, "ratchet", duration=2.0, impact_pulses=1.0, pulse=pulse, limits=Limits())
+    ticks, report = read_recording(path).ticks, audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    clicks = np.flatnonzero(ticks["blow_energy"] > 1e-4)
+    clicks = clicks[clicks > 100]
+    assert len(clicks) >= 3
+    for k in clicks:
+        before, now, after = ticks["tool_position"][k - 1 : k + 2]
+        first = ticks["pulse"][k + 1]
+        # the handle turns about an axis through 0, to which no normal of the pawl is square
+        along = np.cross([0.0, 0.0, 1.0], now) / np.linalg.norm(now)
+        assert abs(first @ along) == pytest.approx(np.linalg.norm(first), rel=1e-4)
+        assert first @ (after - 2.0 * now + before) > 0.0
+
+
 def test_a_mocap_wall_that_strikes_the_tool_gives_a_blow_of_its_speed(tmp_path: Path) -> None:
     scene, path = tmp_path / "wall.xml", tmp_path / "run.mcap"
     geom = f'<geom type="box" size="0.02 0.2 0.2" pos="{GAP + 0.04} 0 0"/>'

@@ -98,7 +98,7 @@ class Tap:
 def tap_words(tap: Tap | None) -> str:
     """Returns what a device can answer a tap with, as a clause; None strikes nothing."""
     if tap is None:
-        return "no blow pays for a pulse: no geom that collides is rigid with the grip"
+        return "no blow pays for a pulse: no geom that moves with the grip collides"
     spare = f"{tap.spare:.2g} N s/m more damping than the coupling needs" if tap.spare else ""
     weak = "" if tap.pulse >= FORCE_FLOOR else ", too weak to be felt"
     return (

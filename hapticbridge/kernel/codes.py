@@ -7,6 +7,8 @@ from enum import IntEnum
 from typing import Any, Literal, TypeAlias
 
 import mujoco
+import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.kernel.record import TickFlag
 
@@ -79,6 +81,12 @@ def held_body(model: mujoco.MjModel, grip: str) -> int:
     """Returns the id of the body that a grip moves, that of its site or of its joint."""
     joint = held_joint(model, grip)
     return int(model.site_bodyid[model.site(grip).id] if joint < 0 else model.jnt_bodyid[joint])
+
+
+def moving_geoms(model: mujoco.MjModel, site: int) -> NDArray[np.bool_]:
+    """Returns a mask of the geoms that move with a site, on it or on joints, shape (ngeom,)."""
+    root = model.body_rootid[model.site_bodyid[site]]
+    return np.asarray(model.body_rootid[model.geom_bodyid] == root, dtype=bool)
 
 
 def name_of_hand(name: str, hand: int) -> str:

@@ -387,7 +387,7 @@ def _turn_actuators(mj: Part) -> None:
         mj.site_xquat + 32 * mj.grip_site_id,
         mj.site_xquat + 32 * mj.handle_site_id,
     )
-    arm = subtract(grip, vector_of(floats(mj.subtree_com + 24 * mj.grip_root_id, 3)))
+    arm = _grip_arm(mj)
     sizes, starts = ints(mj.moment_rownnz, first + 6), ints(mj.moment_rowadr, first + 6)
     dofs, end = ints(mj.grip_dofs, count), starts[first]
     columns = ints(mj.moment_colind, end + 6 * count)
@@ -395,12 +395,32 @@ def _turn_actuators(mj: Part) -> None:
     for row in range(6):
         axis, start = row % 3, end
         for dof in dofs:
-            motion = floats(mj.cdof + 48 * dof, 6)
-            v = vector_of(motion)
-            if row < 3:
-                v = add(vector_of(motion[3:6]), cross(v, arm))
+            v = vector_of(floats(mj.cdof + 48 * dof, 3)) if row >= 3 else _grip_motion(mj, dof, arm)
             moment = v[0] * frame[axis] + v[1] * frame[3 + axis] + v[2] * frame[6 + axis]
             if moment != 0.0:
                 columns[end], moments[end] = dof, moment
                 end += 1
         starts[first + row], sizes[first + row] = start, end - start
+
+
+@compiled
+def _grip_arm(mj: Part) -> Vector:
+    """Returns the grip in m, seen from the point about which ``cdof`` is given."""
+    grip = vector_of(floats(mj.site_xpos + 24 * mj.grip_site_id, 3))
+    return subtract(grip, vector_of(floats(mj.subtree_com + 24 * mj.grip_root_id, 3)))
+
+
+@compiled
+def _grip_motion(mj: Part, dof: int, arm: Vector) -> Vector:
+    """Returns the grip's velocity for a degree of freedom that moves with 1 m/s or 1 rad/s."""
+    motion = floats(mj.cdof + 48 * dof, 6)
+    return add(vector_of(motion[3:6]), cross(vector_of(motion), arm))
+
+
+@compiled
+def grip_acceleration(mj: Part) -> Vector:
+    """Returns (v⁺ − v)/h of the grip in m/s² in the step that just ended, in the scene's frame."""
+    total, arm, change = (0.0, 0.0, 0.0), _grip_arm(mj), floats(mj.qacc, mj.nv)
+    for dof in ints(mj.grip_dofs, mj.grip_dof_count):
+        total = add(total, scaled(change[dof], _grip_motion(mj, dof, arm)))
+    return total

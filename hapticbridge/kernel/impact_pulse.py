@@ -5,10 +5,12 @@ blow on, the device gets beside the coupling's wrench the force in N
 
     p_j = A r exp(−j T/τ) cos(2π f j T) n,    j = 0, 1, 2, …
 
-with the frequency f in Hz, the time constant τ in s, the lever r and the blow's normal n, away from
-what the tool struck. The scene does not get it. A *blow* is a contact of the tool with a force and
-a normal velocity v_n beyond ``BLOW_SPEED`` at the start of the step, v⁺ at its end in m/s. Its
-normal impulse P in N s takes from the bodies
+with the frequency f in Hz, the time constant τ in s, the lever r and the blow's direction n: its
+normal, away from what struck a geom that is rigid with the grip, or the way in which the step
+accelerated the grip, where a part struck that joints connect with it (the pawl of a ratchet). The
+scene does not get it. A *blow* is a contact of the tool with a force and a normal velocity v_n
+beyond ``BLOW_SPEED`` at the start of the step, v⁺ at its end in m/s. Its normal impulse P in N s
+takes from the bodies
 
     W = −P (v_n + v⁺)/2
 
@@ -65,7 +67,7 @@ from hapticbridge.kernel.codes import (
     Part,
     State,
 )
-from hapticbridge.kernel.handle import device_from_scene
+from hapticbridge.kernel.handle import device_from_scene, grip_acceleration
 from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import felt, owe
 from hapticbridge.kernel.ledger import opened_by_mocap
@@ -127,7 +129,7 @@ without a pulse; ``ended_by`` has the flags that ended one early. ``account`` is
 what the scene gave for it, of which it got q times as much, ``work`` Σ p·δp; ``held`` the largest
 pulse in N that the device may hold, ``amplitude`` A in N, ``direction`` n in the device's frame,
 ``newest`` the pulse of this tick and ``sent`` those of the last ticks in N. ``blow_energy`` is the
-W of all blows of the tick, ``normal`` the sum of their normals times W in the scene's frame; of the
+W of all blows of the tick, ``normal`` the sum of their n times W in the scene's frame; of the
 largest blow W, the speed −v_n in m/s, the coefficient of restitution that its contact asks for, and
 v⁺/(−v_n)."""
 
@@ -173,7 +175,8 @@ def note_blows(s: State) -> None:
     note_ends(s)
     ends, force = floats(s.contact.end_velocity, count), floats(pointer_at(mj.efc_force), count)
     velocities = floats(pointer_at(mj.efc_vel), count)
-    is_tool, contacts = ints(mj.geom_is_tool, mj.ngeom), pointer_at(mj.contact)
+    is_tool, is_part = ints(mj.geom_is_tool, mj.ngeom), ints(mj.geom_is_part, mj.ngeom)
+    contacts = pointer_at(mj.contact)
     for c in range(ints(mj.ncon, 1)[0]):
         one = contacts + c * mj.contact_size
         row, geoms = ints(one + mj.contact_row, 1)[0], ints(one + mj.contact_geoms, 2)
@@ -182,12 +185,17 @@ def note_blows(s: State) -> None:
         moved = opened_by_mocap(s, one) / h if s.energy.mocap_has_moved else 0.0
         speed, end = velocities[row] + moved, ends[row] + moved
         energy = -0.5 * h * force[row] * (speed + end)
-        side = is_tool[geoms[1]] - is_tool[geoms[0]]  # the normal points to the second geom
-        if speed > -BLOW_SPEED or side == 0 or energy <= 0.0:
+        is_own = is_part[geoms[0]] != 0 or is_part[geoms[1]] != 0
+        if speed > -BLOW_SPEED or not is_own or energy <= 0.0:
             continue
         impact.blow_energy += energy
-        normal = vector_of(floats(one + mj.contact_frame, 3))
-        store_vector(impact.normal, add(vector_of(impact.normal), scaled(side * energy, normal)))
+        side = is_tool[geoms[1]] - is_tool[geoms[0]]  # the normal points to the second geom
+        way = scaled(side, vector_of(floats(one + mj.contact_frame, 3)))
+        if side == 0:
+            change = grip_acceleration(mj)
+            size = norm(change)
+            way = scaled(1.0 / size, change) if size > 0.0 else change
+        store_vector(impact.normal, add(vector_of(impact.normal), scaled(energy, way)))
         if energy > impact.largest_blow:
             impact.largest_blow, impact.blow_speed = energy, -speed
             impact.blow_restitution, impact.blow_rebound = restitution_of(s, row, -speed, end)

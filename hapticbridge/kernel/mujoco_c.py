@@ -442,7 +442,7 @@ _OWNED = (
     "tree_mass",
     "dof_turns",
 )
-_MASSLESS = ("tool_map", "tool_qpos", "geom_is_tool")
+_MASSLESS = ("tool_map", "tool_qpos", "geom_is_tool", "geom_is_part")
 _SIZES = (
     "nq",
     "nv",

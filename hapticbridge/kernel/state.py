@@ -46,6 +46,7 @@ from hapticbridge.kernel.codes import (
     handle_ids,
     held_body,
     held_joint,
+    moving_geoms,
     name_of_hand,
 )
 from hapticbridge.kernel.colliders import bind_colliders
@@ -384,7 +385,8 @@ class BoundKernel:
             self._own(massless_tool(model, grip))
             mj["tool_map_size"] = self._owned["tool_map"].size
         elif joint < 0:
-            self._own({"geom_is_tool": tool_geoms(model, grip)})
+            parts = np.ascontiguousarray(moving_geoms(model, grip), dtype=np.int32)
+            self._own({"geom_is_tool": tool_geoms(model, grip), "geom_is_part": parts})
         if parameters.scheme == Scheme.MIDPOINT and not parameters.scene_ticks:
             body = int(model.site_bodyid[grip])
             arrays = bind_lossless(self._record, model, data, body, first)

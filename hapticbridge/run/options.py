@@ -51,6 +51,7 @@ from hapticbridge.errors import (
     RecordingError,
     SceneError,
 )
+from hapticbridge.kernel.codes import moving_geoms
 from hapticbridge.kernel.parameters import (
     MAX_BUTTONS,
     MAX_SCENE_TICKS,
@@ -73,7 +74,7 @@ from hapticbridge.realtime import busy_step_time, scene_ticks_for, wants_real_ti
 from hapticbridge.run.commands import CouplingLimits
 from hapticbridge.scene import Scene, custom_text
 from hapticbridge.scene.contacts import meeting_pairs
-from hapticbridge.scene.physics import site_inertia
+from hapticbridge.scene.physics import geom_inertia, site_inertia
 from hapticbridge.scene.rehearsal import (
     HOLDING_STEPS,
     TIPPED,
@@ -654,17 +655,21 @@ class RunSetup(StepTimes):
     def tap(self) -> Tap | None:
         """Returns a tap of the tool on what does not bounce.
 
-        The tool counts with its smallest inertia at the grip. It is None if no geom that collides
-        is rigid with the grip.
+        The tool counts with its smallest inertia at the grip; where no geom that collides is rigid
+        with the grip, its parts on joints with theirs. It is None if none collides.
         """
         model, data = self.scene.model, mujoco.MjData(self.scene.model)
         grip = model.site(self.scene.grip).id
-        is_tool = tool_geoms(model, grip)
-        if not any(is_tool[geom] for pair in meeting_pairs(model) for geom in pair[:2]):
+        pairs = [pair[:2] for pair in meeting_pairs(model, moving_geoms(model, grip))]
+        if not pairs:
             return None
         data.qpos[:] = self.scene.data.qpos
         mujoco.mj_forward(model, data)  # a check of the scene may have left another inertia
         mass = site_inertia(model, data, grip)
+        is_tool, is_part = tool_geoms(model, grip), moving_geoms(model, grip)
+        geoms = {geom for pair in pairs for geom in pair if is_part[geom]}
+        if not any(is_tool[geom] for geom in geoms):
+            mass = min(geom_inertia(model, data, geom) for geom in geoms)
         return Tap.of(self.unloaded(_AT_REST, None), mass)
 
     def holding(self, start: NDArray[np.void], effective: Coupling | None) -> RunParameters:

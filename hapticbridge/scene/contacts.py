@@ -49,6 +49,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import SceneError, SceneWarning
+from hapticbridge.kernel.codes import moving_geoms
 
 STRICT_STEPS = 60.0
 """τ/h above which a contact of moderate stiffness created no energy in any run of the map (its
@@ -374,8 +375,7 @@ def contact_settings(model: mujoco.MjModel, grip: str) -> Iterator[tuple[int, in
 
 def tool_geoms(model: mujoco.MjModel, grip: str) -> NDArray[np.bool_]:
     """Returns a mask of the geoms that move with the grip, shape (ngeom,)."""
-    root = model.body_rootid[model.site(grip).bodyid[0]]
-    return np.asarray(model.body_rootid[model.geom_bodyid] == root, dtype=bool)
+    return moving_geoms(model, model.site(grip).id)
 
 
 def settings_among(

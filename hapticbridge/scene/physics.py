@@ -111,6 +111,15 @@ def site_inertia(model: mujoco.MjModel, data: mujoco.MjData, site: int) -> float
     return _inertia_along(model, data, jacobian)
 
 
+def geom_inertia(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    """Returns the inertia in kg at a geom's centre, as ``body_inertia`` at a centre of mass."""
+    if model.nv == 0:
+        return math.inf
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jacGeom(model, data, jacobian, None, geom)
+    return _inertia_along(model, data, jacobian)
+
+
 def site_weight(model: mujoco.MjModel, data: mujoco.MjData, site: int) -> float:
     """Returns the force in N that holds a site against weight, springs and motors at rest.
 
