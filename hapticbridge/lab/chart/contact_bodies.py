@@ -513,17 +513,3 @@ class Tap(Staged):
             handle=motion_along(tapping, duration, self._finest),
         )
         return PeerWork((task,), duration, self._judge)
-
-    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
-        (take,) = takes
-        if take.has_diverged:
-            return {TAP_PANEL.key: diverged(take.created, take.ended)}
-        records = take.records_at(self._grid)
-        has_touched = bool(np.any(records["contacts"] > 0))
-        score = score_of(
-            self._reference,
-            records,
-            created=take.created,
-            verdict=take.environment if has_touched else "lost contact",
-        )
-        return {TAP_PANEL.key: score}

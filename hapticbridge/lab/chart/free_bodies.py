@@ -140,17 +140,6 @@ class DrivenMass(Staged):
         scene = load_scene("point_mass")
         return work_of(scene, handle_path, self._duration, self._finest, self.coupling, self._judge)
 
-    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
-        (take,) = takes
-        if take.has_diverged:
-            return {DRIVEN_PANEL.key: diverged(take.created, take.ended)}
-        records = take.records_at(self._grid)
-        return {
-            DRIVEN_PANEL.key: score_of(
-                self._reference, records, created=take.created, verdict=take.environment
-            )
-        }
-
 
 SPINNING_MASS = 0.3
 """Mass in kg."""
@@ -375,15 +364,3 @@ class SpringArm(Staged):
             StudyError: Always.
         """
         raise StudyError("the arm has a hinge, and other engines are given free bodies alone")
-
-    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
-        (take,) = takes
-        if take.has_diverged:
-            return {ARM_PANEL.key: diverged(take.created, take.ended)}
-        score = score_of(
-            self._reference,
-            take.records_at(self._grid),
-            created=take.created,
-            verdict=take.environment,
-        )
-        return {ARM_PANEL.key: score}

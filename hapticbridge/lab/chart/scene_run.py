@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -393,7 +392,7 @@ def fine_records(
     return kept
 
 
-class Staged(ABC):
+class Staged:
     """A workload whose points are one stage at different settings.
 
     Args:
@@ -407,6 +406,11 @@ class Staged(ABC):
     """
 
     needs_tool: ClassVar[str] = ""
+    panels: Sequence[Panel]
+    has_contact: bool
+    # of a workload that is judged by one reference: its rows, and the time between them in s
+    _reference: NDArray[np.void]
+    _grid: float
 
     def __init__(
         self, coupling: Coupling, stages: Stages, references: References | None = None
@@ -426,9 +430,23 @@ class Staged(ABC):
             raise StudyError(f"method '{method.name}' {self.needs_tool}")
         return SceneRun(self._stages.for_method(setting), setting, self._judge)
 
-    @abstractmethod
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
-        """Returns the scores of a point's takes by ``Panel.key``."""
+        """Returns the scores of a point's takes by ``Panel.key``: one take against the reference.
+
+        The tool of a workload with contact must touch, or it is not the workload's motion.
+        """
+        (take,), (panel,) = takes, self.panels
+        if take.has_diverged:
+            return {panel.key: diverged(take.created, take.ended)}
+        records = take.records_at(self._grid)
+        is_lost = self.has_contact and not np.any(records["contacts"] > 0)
+        score = score_of(
+            self._reference,
+            records,
+            created=take.created,
+            verdict="lost contact" if is_lost else take.environment,
+        )
+        return {panel.key: score}
 
 
 COUPLING = Coupling(1000.0, 1.0, 1.0, 1e-3)
