@@ -10,12 +10,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
-from typing import BinaryIO, Literal, NamedTuple, Protocol, get_args
+from typing import BinaryIO, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion, pose_at
 from hapticbridge.errors import StudyError, choices
@@ -82,15 +81,6 @@ Kind = Literal["box", "sphere", "capsule", "mesh"]
 SIZES = {"box": 3, "sphere": 1, "capsule": 2, "mesh": 0}
 """Count of numbers in a shape's size, by kind."""
 
-NORM_TOLERANCE = 1e-9
-"""Largest deviation of a quaternion's norm from 1. It admits rounding and refuses a wrong
-scaling."""
-
-MAX_STEPS = 10**8
-"""Largest number of steps in a run: a day at 1 kHz."""
-
-_ARGUMENTS = Arguments(StudyError)
-
 
 class Pose(NamedTuple):
     """A position in m and an orientation, a unit quaternion (w, x, y, z)."""
@@ -110,22 +100,6 @@ ORIGIN = Pose()
 AT_REST = Velocity()
 
 
-def check_pose(name: str, pose: Pose) -> None:
-    """Refuses a pose that is not finite or whose quaternion is not of norm 1 within 1e-9.
-
-    Raises:
-        StudyError: The pose is not finite or not of unit norm.
-    """
-    _vector(f"{name} position", pose.position, "m")
-    quaternion = _ARGUMENTS.numbers(f"{name} quaternion", pose.quaternion)
-    norm = float(np.linalg.norm(quaternion))
-    if quaternion.shape != (4,) or not abs(norm - 1.0) <= NORM_TOLERANCE:
-        raise StudyError(
-            f"{name} quaternion is {pose.quaternion}; it must be four numbers of norm 1 "
-            f"within {NORM_TOLERANCE:g}"
-        )
-
-
 def composed(outer: Pose, inner: Pose) -> Pose:
     """Returns in the world frame the pose ``inner``, which is given in the frame ``outer``."""
     position = add(outer.position, rotated(outer.quaternion, inner.position))
@@ -136,11 +110,6 @@ def inverted(pose: Pose) -> Pose:
     """Returns the pose of the world in the frame ``pose``."""
     back = conjugate(pose.quaternion)
     return Pose(rotated(back, scaled(-1.0, pose.position)), canonical(back))
-
-
-def _vector(name: str, value: Vector, unit: str) -> None:
-    if _ARGUMENTS.numbers(name, value, unit).shape != (3,):
-        raise StudyError(f"{name} is {value}; it must be three numbers in {unit}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,9 +124,6 @@ class Shape:
         quaternion: Orientation of its axes.
         vertices: Vertices of a mesh in its own frame, in m, shape (n, 3), n >= 4. The shape is
             their convex hull.
-
-    Raises:
-        StudyError: A value is not finite, out of range or mis-shaped.
     """
 
     kind: Kind
@@ -165,25 +131,6 @@ class Shape:
     position: Vector = (0.0, 0.0, 0.0)
     quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
     vertices: NDArray[np.float64] | None = None
-
-    def __post_init__(self) -> None:
-        if self.kind not in get_args(Kind):
-            raise StudyError(f"shape kind is {self.kind!r}; kinds: {choices(get_args(Kind))}")
-        if len(self.size) != SIZES[self.kind]:
-            raise StudyError(
-                f"size of a {self.kind} has {len(self.size)} numbers; it has {SIZES[self.kind]}"
-            )
-        if self.size:
-            _ARGUMENTS.numbers(f"{self.kind} size", self.size, "m", least=0, is_open=True)
-        check_pose("shape", self.pose)
-        if (self.vertices is None) == (self.kind == "mesh"):
-            raise StudyError("a mesh has vertices, and no other shape has")
-        if self.vertices is not None:
-            points = _ARGUMENTS.numbers("mesh vertices", self.vertices, "m")
-            if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
-                raise StudyError(
-                    f"mesh vertices have shape {points.shape}; they must be (n, 3) with n >= 4"
-                )
 
     @property
     def pose(self) -> Pose:
@@ -201,9 +148,6 @@ class Body:
         inertia_frame: Centre of mass and principal axes in the body's frame.
         shapes: Shapes in the body's frame; may be empty.
         friction: Coulomb's coefficient of every contact, without unit, >= 0.
-
-    Raises:
-        StudyError: A value is not finite or out of range.
     """
 
     mass: float
@@ -211,18 +155,6 @@ class Body:
     inertia_frame: Pose = ORIGIN
     shapes: tuple[Shape, ...] = ()
     friction: float = 0.0
-
-    def __post_init__(self) -> None:
-        _ARGUMENTS.number("mass", self.mass, "kg", least=0, is_open=True)
-        moments = _ARGUMENTS.numbers("inertia", self.inertia, "kg m²", least=0, is_open=True)
-        # 1e-9 for moments of a flat body, whose largest equals the sum by rounding
-        if moments.shape != (3,) or 2 * moments.max() > moments.sum() * (1 + 1e-9):
-            raise StudyError(
-                f"inertia is {self.inertia}; it must be three moments in kg m², "
-                "none larger than the sum of the other two"
-            )
-        check_pose("inertia frame", self.inertia_frame)
-        _ARGUMENTS.number("friction", self.friction, least=0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,16 +164,10 @@ class FreeBody:
     Attributes:
         body: Mass, inertia and shapes.
         start: Pose of the body's frame at the start.
-
-    Raises:
-        StudyError: The pose is not finite or not of unit norm.
     """
 
     body: Body
     start: Pose = ORIGIN
-
-    def __post_init__(self) -> None:
-        check_pose("start", self.start)
 
     @property
     def principal(self) -> Pose:
@@ -271,9 +197,6 @@ class Task:
         handle: Poses of the handle in the world frame over time. None keeps it at the grip's pose
             at the start.
         others: Other free bodies, at rest at the start, with the friction of the tool.
-
-    Raises:
-        StudyError: A value is not finite or mis-shaped, or the friction differs.
     """
 
     name: str
@@ -287,15 +210,6 @@ class Task:
     handle: Motion | None = None
     others: tuple[FreeBody, ...] = ()
 
-    def __post_init__(self) -> None:
-        _vector("gravity", self.gravity, "m/s²")
-        if any(other.body.friction != self.body.friction for other in self.others):
-            raise StudyError("the bodies of a task differ in friction, and a task has one")
-        check_pose("grip", self.grip)
-        check_pose("start", self.start)
-        _vector("start velocity", self.start_velocity.linear, "m/s")
-        _vector("start angular velocity", self.start_velocity.angular, "rad/s")
-
     @property
     def bodies(self) -> tuple[FreeBody, ...]:
         """Free bodies at their start, the tool first."""
@@ -307,12 +221,7 @@ class Task:
         Args:
             timestep: T in s.
             steps: N.
-
-        Raises:
-            StudyError: The timestep is not finite and positive, or N < 1.
         """
-        check_timestep(timestep)
-        _ARGUMENTS.whole("steps", steps, least=1, most=MAX_STEPS)
         if self.handle is None:
             return [composed(self.start, self.grip)] * (steps + 1)
         found, cursor = [], 0
@@ -320,15 +229,6 @@ class Task:
             cursor, position, quaternion = pose_at(self.handle.table, k * timestep, cursor)
             found.append(Pose(position, quaternion))
         return found
-
-
-def check_timestep(timestep: float) -> float:
-    """Returns a timestep in s, one finite number > 0.
-
-    Raises:
-        StudyError: It is not finite or not > 0.
-    """
-    return _ARGUMENTS.number("timestep", timestep, "s", least=0, is_open=True)
 
 
 class Wrench(NamedTuple):
@@ -420,7 +320,7 @@ class Engine(Protocol):
         """Opens a task with steps of ``timestep`` in s.
 
         Raises:
-            StudyError: The engine cannot describe the task, or the timestep is out of range.
+            StudyError: The engine cannot describe the task.
         """
 
 

@@ -267,12 +267,7 @@ class HeldSimulation(ABC):
     """
 
     def __init__(self, task: base.Task, timestep: float) -> None:
-        """Stores the task and computes the poses of the handle.
-
-        Raises:
-            StudyError: The timestep is not finite and positive.
-        """
-        self._timestep = base.check_timestep(timestep)
+        self._timestep = timestep
         coupling = task.coupling
         self._gains = (
             None
