@@ -301,27 +301,22 @@ class Simulation(Protocol):
         """Releases the resources of the engine. Closing twice is allowed."""
 
 
-class Engine(Protocol):
-    """A physics engine, tuned as its own documentation advises."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Engine:
+    """A physics engine, tuned as its own documentation advises.
 
-    @property
-    def name(self) -> str:
-        """Name for ``--engines``."""
+    Attributes:
+        name: Name for ``--engines``.
+        version: Version of the installed library.
+        settings: Settings with the pages of the documentation that advise them.
+        open: Opens a task with steps of a length in s; raises StudyError where the engine cannot
+            describe the task.
+    """
 
-    @property
-    def version(self) -> str:
-        """Version of the installed library."""
-
-    @property
-    def settings(self) -> Mapping[str, Advised]:
-        """Settings with the pages of the documentation that advise them."""
-
-    def open(self, task: Task, timestep: float) -> Simulation:
-        """Opens a task with steps of ``timestep`` in s.
-
-        Raises:
-            StudyError: The engine cannot describe the task.
-        """
+    name: str
+    version: str
+    settings: Mapping[str, Advised]
+    open: Callable[[Task, float], Simulation]
 
 
 _PACKAGE = "hapticbridge.lab.engines"

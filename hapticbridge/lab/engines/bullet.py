@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -57,27 +58,6 @@ _TYPES = {
     "sphere": pybullet.GEOM_SPHERE,
     "capsule": pybullet.GEOM_CAPSULE,
 }
-
-
-class PybulletEngine:
-    """Bullet's multibody world with one of its solvers."""
-
-    version = version("pybullet")
-
-    def __init__(self, name: str, parameters: Mapping[str, float], solver: str) -> None:
-        """Takes its name, options of ``setPhysicsEngineParameter`` and the solver's name."""
-        self.name = name
-        self._parameters = dict(parameters)
-        raw = {key: base.Advised(f"{value:g}", _PARAMETERS) for key, value in parameters.items()}
-        self.settings: Mapping[str, base.Advised] = {
-            **_SHARED,
-            **raw,
-            "constraintSolverType": base.Advised(solver, _PARAMETERS),
-        }
-
-    def open(self, task: base.Task, timestep: float) -> PybulletSimulation:
-        """Opens a task; see ``Engine.open``."""
-        return PybulletSimulation(task, timestep, self._parameters)
 
 
 class PybulletSimulation(HeldSimulation):
@@ -230,7 +210,19 @@ def engines() -> tuple[base.Engine, ...]:
         "globalCFM": CFM,
         "constraintSolverType": pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG,
     }
-    return (
-        PybulletEngine("pybullet", impulses, "sequential impulses (default)"),
-        PybulletEngine("pybullet_dantzig", direct, "Dantzig, direct (marked experimental)"),
+    return tuple(
+        base.Engine(
+            name,
+            version("pybullet"),
+            {
+                **_SHARED,
+                **{key: base.Advised(f"{value:g}", _PARAMETERS) for key, value in chosen.items()},
+                "constraintSolverType": base.Advised(solver, _PARAMETERS),
+            },
+            partial(PybulletSimulation, parameters=chosen),
+        )
+        for name, chosen, solver in (
+            ("pybullet", impulses, "sequential impulses (default)"),
+            ("pybullet_dantzig", direct, "Dantzig, direct (marked experimental)"),
+        )
     )

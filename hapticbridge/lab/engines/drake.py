@@ -6,7 +6,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from functools import partial
 from importlib.metadata import version
 from itertools import count
 from typing import Any
@@ -56,22 +56,6 @@ _SHARED = {
     "sap_near_rigid_threshold": base.Advised("0", f"{_PLANT}: set_sap_near_rigid_threshold"),
     "use_sampled_output_ports": base.Advised("False", f"{_PLANT}: SetUseSampledOutputPorts"),
 }
-
-
-class DrakeEngine:
-    """Drake with one of its contact models."""
-
-    version = version("drake")
-
-    def __init__(self, name: str, contact_model: str, settings: Mapping[str, base.Advised]) -> None:
-        """Takes its name, Drake's name of the contact model, and the settings of that model."""
-        self.name = name
-        self._contact_model = contact_model
-        self.settings: Mapping[str, base.Advised] = {**_SHARED, **settings}
-
-    def open(self, task: base.Task, timestep: float) -> DrakeSimulation:
-        """Opens a task; see ``Engine.open``."""
-        return DrakeSimulation(task, timestep, self._contact_model)
 
 
 class DrakeSimulation(HeldSimulation):
@@ -230,7 +214,12 @@ def engines() -> tuple[base.Engine, ...]:
         ),
         "relaxation_time": base.Advised("1 timestep", f"{_PROPERTIES}: relaxation_time"),
     }
-    return (
-        DrakeEngine("drake_point", "point", point),
-        DrakeEngine("drake_hydroelastic", "hydroelastic", hydroelastic),
+    return tuple(
+        base.Engine(
+            f"drake_{model}",
+            version("drake"),
+            {**_SHARED, **settings},
+            partial(DrakeSimulation, contact_model=model),
+        )
+        for model, settings in (("point", point), ("hydroelastic", hydroelastic))
     )
