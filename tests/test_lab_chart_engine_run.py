@@ -18,8 +18,9 @@ from hapticbridge.lab.chart.chart import Chart, Extent, measure_chart, open_work
 from hapticbridge.lab.chart.engine_run import EngineRun, Meter, peer_settings
 from hapticbridge.lab.chart.output import summary_of
 from hapticbridge.lab.chart.peg import JammedPeg
+from hapticbridge.lab.chart.scene_run import Workload
+from hapticbridge.lab.chart.score import PeerWork
 from hapticbridge.lab.chart.setting import OWN, Setting
-from hapticbridge.lab.chart.workload import PeerWork, Workload
 from hapticbridge.lab.engines import mujoco as mujoco_engine
 from hapticbridge.lab.engines.base import (
     Body,

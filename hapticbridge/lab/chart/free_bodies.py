@@ -18,8 +18,8 @@ from hapticbridge.demand.pulse import FORCE_FLOOR
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import work_of
-from hapticbridge.lab.chart.scene_run import Prepared, Staged, Stages
-from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
+from hapticbridge.lab.chart.scene_run import Prepared, Stages, Workload
+from hapticbridge.lab.chart.score import Panel, PeerWork, Score, Take, diverged, score_of
 from hapticbridge.lab.engines.base import Velocity
 from hapticbridge.lab.maps.base import free_body, scene_of
 from hapticbridge.scene import Scene, load_scene
@@ -109,7 +109,7 @@ def exact_records(coupling: Coupling, grid: float) -> NDArray[np.void]:
     return records
 
 
-class DrivenMass(Staged):
+class DrivenMass(Workload):
     """The driven point mass as a workload.
 
     Args:
@@ -201,7 +201,7 @@ def exact_orientations(grid: float, count: int) -> NDArray[np.float64]:
     return np.where(orientation[:, :1] < 0, -orientation, orientation)
 
 
-class SpinningBody(Staged):
+class SpinningBody(Workload):
     """The tumbling body as a workload.
 
     Args:
@@ -335,7 +335,7 @@ def exact_arm(coupling: Coupling, grid: float, count: int) -> NDArray[np.void]:
     return records
 
 
-class SpringArm(Staged):
+class SpringArm(Workload):
     """The arm as a workload.
 
     Args:

@@ -14,8 +14,8 @@ from hapticbridge.kernel.pose import quaternion_exp
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import work_of
 from hapticbridge.lab.chart.peg import RAMP, STAY, led, score_at_rest
-from hapticbridge.lab.chart.scene_run import Prepared, Staged, Stages
-from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take
+from hapticbridge.lab.chart.scene_run import Prepared, Stages, Workload
+from hapticbridge.lab.chart.score import Panel, PeerWork, Score, Take
 from hapticbridge.lab.maps.base import scene_of
 from hapticbridge.run.options import Workspace
 from hapticbridge.scene import Scene
@@ -142,7 +142,7 @@ def leaning_force(coupling: Coupling, times: NDArray[np.float64]) -> NDArray[np.
     return force
 
 
-class Stack(Staged):
+class Stack(Workload):
     """The stack as a workload.
 
     Args:
@@ -302,7 +302,7 @@ def turning(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
     return led(_KEY_PATH, times)
 
 
-class HexSocket(Staged):
+class HexSocket(Workload):
     """The key in its socket as a workload.
 
     Args:
