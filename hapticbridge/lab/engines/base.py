@@ -6,11 +6,12 @@ import ctypes
 import os
 import sys
 import tempfile
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
-from typing import BinaryIO, Literal, NamedTuple, Protocol
+from typing import BinaryIO, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +20,20 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion, pose_at
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.files import install_command
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.pose import (
+    ZERO_VECTOR,
     Quaternion,
     Vector,
     add,
     canonical,
     conjugate,
+    cross,
     product,
     rotated,
+    rotation_between,
     scaled,
+    subtract,
 )
 
 _STDOUT = 1
@@ -263,29 +269,71 @@ class Advised(NamedTuple):
     source: str
 
 
-class Simulation(Protocol):
-    """A task in an engine, at some step. Step 0 is the start.
+Frame = tuple[Vector, Quaternion]
+"""Position in m and orientation, as the compiler stores them."""
 
-    Body 0 is the tool; the others follow in the task's order.
+_AT_ORIGIN = (ZERO_VECTOR, (1.0, 0.0, 0.0, 0.0))
+
+
+class Simulation(ABC):
+    """A task in an engine, at some step, with a coupling that the engine holds for a step.
+
+    Step 0 is the start. Body 0 is the tool; the others follow in the task's order. The coupling is
+    a force and a torque, applied to the engine every step:
+
+        f_k = K e_k + (B/T)(e_k − e_{k−1}),    e = h − x
+        τ_k = K_r φ_k + (B_r/T)(δφ_h − δφ_x),  φ = log(R_h R_xᵀ)
+
+    with the handle h and the grip x at the end of step k; step k + 1 runs under (f_k, τ_k), moved
+    to the centre of mass. This is ``theory.drive_mass``'s scheme ``held``. The handle has not moved
+    before step 0.
+
+    Engines describe a body by its centre of mass. A child's body is therefore the frame of the
+    principal axes of inertia; ``FreeBody`` converts to it. A child opens its engine in
+    ``__init__`` after that of this class, and calls ``_begin`` last.
     """
 
+    def __init__(self, task: Task, timestep: float) -> None:
+        self._timestep = timestep
+        coupling = task.coupling
+        self._gains = (
+            None
+            if coupling is None
+            else (
+                coupling.stiffness,
+                coupling.damping / timestep,
+                coupling.rotational_stiffness,
+                coupling.rotational_damping / timestep,
+            )
+        )
+        self._grip = (task.grip.position, task.grip.quaternion)
+        self._frames = [free.body.inertia_frame for free in task.bodies]
+        self._body_in_principal = [inverted(frame) for frame in self._frames]
+        self._centre = task.body.inertia_frame.position
+        self._handle: Frame = _AT_ORIGIN
+        self._tool: Frame = _AT_ORIGIN
+        self._wrench = self._at_centre = self._held = (ZERO_VECTOR, ZERO_VECTOR)
+
+    def _begin(self, task: Task) -> None:
+        """Computes the wrench of step 0."""
+        handle = task.handle_poses(self._timestep, 1)[0]
+        self._handle = (handle.position, handle.quaternion)
+        grip = composed(self.pose(), task.grip)
+        self._tool = (grip.position, grip.quaternion)
+        self._measure(self._handle)
+
     def step(self, handle_position: Vector, handle_quaternion: Quaternion) -> None:
-        """Advances from step k − 1 to step k, at whose end the handle is at h_k.
+        """Advances to step k, at whose end the handle is at h_k, under f_{k−1}; computes f_k."""
+        self._couple((handle_position, handle_quaternion))
+        self._measure((handle_position, handle_quaternion))
 
-        A held coupling acts on the tool during the step with f_{k−1}; f_k is computed at its end.
-        """
-
-    def advance(self, force: Vector, torque: Vector) -> None:
-        """Sets a force in N and a torque in N m at the centre of mass and steps; this is timed."""
-
-    def pose(self, body: int = 0) -> Pose:
-        """Returns the pose of a body's frame."""
-
-    def velocity(self, body: int = 0) -> Velocity:
-        """Returns the velocity of a body's centre of mass and its angular velocity."""
+    def _couple(self, _handle: Frame) -> None:
+        """Advances the engine; a child whose engine has its own spring aims it at the handle."""
+        self.advance(*self._at_centre)
 
     def wrench(self) -> Wrench:
         """Returns the coupling's wrench f_k on the tool, about the grip."""
+        return Wrench(*self._wrench)
 
     def applied(self) -> Wrench:
         """Returns the coupling's wrench on the tool during the last step, about the grip.
@@ -293,12 +341,74 @@ class Simulation(Protocol):
         A held coupling applies f_{k−1}, a spring of the engine's own f_k. It is nan where the
         engine does not tell its spring's force.
         """
+        return Wrench(*self._held)
 
+    def _measure(self, handle: Frame) -> None:
+        if self._gains is None:
+            return
+        self._held = self._wrench
+        pose = self.pose()
+        self._tool, self._wrench, self._at_centre = _law(
+            self._gains,
+            (pose.position, pose.quaternion),
+            self._grip,
+            self._centre,
+            self._handle,
+            handle,
+            self._tool,
+        )
+        self._handle = handle
+
+    @abstractmethod
+    def advance(self, force: Vector, torque: Vector) -> None:
+        """Sets a force in N and a torque in N m at the centre of mass and steps; this is timed."""
+
+    @abstractmethod
+    def principal_pose(self, body: int = 0) -> Pose:
+        """Returns the pose of the principal axes of inertia at a body's centre of mass."""
+
+    def pose(self, body: int = 0) -> Pose:
+        """Returns the pose of a body's frame."""
+        return composed(self.principal_pose(body), self._body_in_principal[body])
+
+    @abstractmethod
+    def velocity(self, body: int = 0) -> Velocity:
+        """Returns the velocity of a body's centre of mass and its angular velocity."""
+
+    @abstractmethod
     def contacts(self) -> Contacts:
         """Returns the contacts of the last step."""
 
+    @abstractmethod
     def close(self) -> None:
         """Releases the resources of the engine. Closing twice is allowed."""
+
+
+@compiled
+def _law(
+    gains: tuple[float, float, float, float],
+    body: Frame,
+    grip: Frame,
+    centre: Vector,
+    handle_before: Frame,
+    handle: Frame,
+    tool_before: Frame,
+) -> tuple[Frame, tuple[Vector, Vector], tuple[Vector, Vector]]:
+    """Returns the grip's pose, the wrench about it, and the same wrench at the centre of mass."""
+    stiffness, damping, rotational_stiffness, rotational_damping = gains
+    position = add(body[0], rotated(body[1], grip[0]))
+    orientation = product(body[1], grip[1])
+    stretched = subtract(subtract(handle[0], handle_before[0]), subtract(position, tool_before[0]))
+    twisted = subtract(
+        rotation_between(handle_before[1], handle[1]), rotation_between(tool_before[1], orientation)
+    )
+    force = add(scaled(stiffness, subtract(handle[0], position)), scaled(damping, stretched))
+    torque = add(
+        scaled(rotational_stiffness, rotation_between(orientation, handle[1])),
+        scaled(rotational_damping, twisted),
+    )
+    lever = subtract(position, add(body[0], rotated(body[1], centre)))
+    return (position, orientation), (force, torque), (force, add(torque, cross(lever, force)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,6 @@ import pybullet
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.pose import Quaternion, Vector
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import HeldSimulation
 
 SLOP = 1e-7
 """Depth in m that a contact keeps under sequential impulses. A settled tool is wrong by Bullet's
@@ -60,7 +59,7 @@ _TYPES = {
 }
 
 
-class PybulletSimulation(HeldSimulation):
+class PybulletSimulation(base.Simulation):
     """A task in its own Bullet world."""
 
     def __init__(self, task: base.Task, timestep: float, parameters: Mapping[str, float]) -> None:

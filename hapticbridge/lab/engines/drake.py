@@ -32,7 +32,6 @@ from pydrake.systems.framework import DiagramBuilder
 
 from hapticbridge.kernel.pose import Vector
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import HeldSimulation
 
 POINT_STIFFNESS = 1e7
 """Stiffness of a point contact in N/m. The remaining error stems from Drake's single point for two
@@ -58,7 +57,7 @@ _SHARED = {
 }
 
 
-class DrakeSimulation(HeldSimulation):
+class DrakeSimulation(base.Simulation):
     """A task in Drake.
 
     Drake refuses to continue from a state that is not finite; from then on the pose is nan.

@@ -12,7 +12,6 @@ import mujoco
 
 from hapticbridge.kernel.pose import Vector, add, conjugate, cross, rotated, subtract
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import HeldSimulation
 
 _MODELING = "MuJoCo documentation, Modeling: Solver parameters"
 _OVERVIEW = "MuJoCo documentation, Computation: Numerical integration"
@@ -53,7 +52,7 @@ SETTINGS: Mapping[str, base.Advised] = {
 """Settings: ``implicitfast``, the elliptic cone, and contacts as stiff as MuJoCo advises."""
 
 
-class MujocoSimulation(HeldSimulation):
+class MujocoSimulation(base.Simulation):
     """A task in MuJoCo."""
 
     def __init__(self, task: base.Task, timestep: float) -> None:

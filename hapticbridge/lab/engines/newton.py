@@ -21,7 +21,6 @@ from scipy.spatial import ConvexHull
 
 from hapticbridge.kernel.pose import Vector
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import HeldSimulation
 
 GAP = 1e-3
 """Distance in m at which contacts are made. It covers the motion of some steps and is small against
@@ -45,7 +44,7 @@ Solver = Callable[[Any], Any]
 """Function that makes a solver for a model."""
 
 
-class NewtonSimulation(HeldSimulation):
+class NewtonSimulation(base.Simulation):
     """A task in Newton."""
 
     def __init__(self, task: base.Task, timestep: float, solver: Solver) -> None:

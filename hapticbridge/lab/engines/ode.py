@@ -32,7 +32,6 @@ from hapticbridge.kernel.pose import (
     subtract,
 )
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import Frame, HeldSimulation
 
 _NAMES = ("libode.so.8", "libode.so.6", "libode.so", "libode.dylib")
 
@@ -251,7 +250,7 @@ SETTINGS: Mapping[str, base.Advised] = {
 """Settings of ODE with its direct solver."""
 
 
-class OdeSimulation(HeldSimulation):
+class OdeSimulation(base.Simulation):
     """A task in ODE."""
 
     def __init__(self, task: base.Task, timestep: float) -> None:
@@ -432,7 +431,7 @@ class OdeSpringSimulation(OdeSimulation):
         """Returns the wrench of the joints in the last step: the law's at its end."""
         return self.wrench()
 
-    def _couple(self, handle: Frame) -> None:
+    def _couple(self, handle: base.Frame) -> None:
         """Aims the joints at the handle, and steps."""
         if self._gains is not None:
             stiffness, damping, rotational_stiffness, rotational_damping = self._gains

@@ -25,7 +25,6 @@ from hapticbridge.kernel.pose import (
     subtract,
 )
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import Frame, HeldSimulation
 
 with warnings.catch_warnings():
     # that no graphics card was found, which nothing here draws on
@@ -86,7 +85,7 @@ SETTINGS: Mapping[str, base.Advised] = {
 """Settings of PhysX 5 with its temporal Gauss-Seidel solver."""
 
 
-class SapienSimulation(HeldSimulation):
+class SapienSimulation(base.Simulation):
     """A task in its own PhysX scene."""
 
     def __init__(self, task: base.Task, timestep: float) -> None:
@@ -210,7 +209,7 @@ class SapienSpringSimulation(SapienSimulation):
         """Returns nan: the drive's force changes with the solver's iterations."""
         return base.Wrench((math.nan,) * 3, (math.nan,) * 3)
 
-    def _couple(self, handle: Frame) -> None:
+    def _couple(self, handle: base.Frame) -> None:
         """Aims the drive at the handle, and steps."""
         if self._gains is not None:
             rate = 1.0 / self._timestep

@@ -14,7 +14,6 @@ import rapier3d
 
 from hapticbridge.kernel.pose import Vector
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import HeldSimulation
 
 LENGTH = 1e-3
 """``length_unit`` in m, of which the allowed depth and the distance of prediction are shares. The
@@ -59,7 +58,7 @@ iterations, under one held force. Of its models of friction the default is exact
 "Coulomb" lets it slide with 0.85 of the friction."""
 
 
-class RapierSimulation(HeldSimulation):
+class RapierSimulation(base.Simulation):
     """A task in its own Rapier world."""
 
     def __init__(self, task: base.Task, timestep: float) -> None:
