@@ -27,7 +27,6 @@ from hapticbridge.device.haply import HaplyDevice
 from hapticbridge.device.haply import opened as open_haply
 from hapticbridge.device.pid.device import PidDevice, open_pid
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
-from hapticbridge.identify import AxisFit, identify
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 
 PERIOD = 1e-3
@@ -180,13 +179,3 @@ def unheld(driver: str, numbers: Mapping[str, float]) -> tuple[Device, Clock]:
 
 
 DRIVERS = ("simulated", "falcon", "rawhid", "pid", "haply", "forcedimension", "touch")
-
-
-def identified(driver: str, seed: int, axis: str, duration: float = 10.0) -> AxisFit:
-    """Returns what is measured of a random device that nobody holds."""
-    device, clock = unheld(driver, mechanics(seed))
-    try:
-        found = identify(device, clock, period=PERIOD, axes=(axis,), duration=duration)
-    finally:
-        device.close()
-    return found.fits[axis]

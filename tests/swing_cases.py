@@ -19,16 +19,6 @@ GRIPS = {
 }
 """Grips from two fingers to an arm that holds hard."""
 
-LIFTED = {
-    "planar_peg": -0.045,
-    "peg_in_hole": -0.045,
-    "round_peg": -0.045,
-    "screwdriver": -0.002,
-    "hex_key": -0.002,
-}
-"""By how much a hand goes up in m before it is random: into the hole, onto the screw."""
-
-
 ALARM = int(TickFlag.SWINGING | TickFlag.RUNS_AWAY)
 """Flags of what the watch finds."""
 
@@ -47,10 +37,7 @@ FAST_SCENES = {
     "hammer": ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     "peg_in_hole": ((0.0, 0.0, -0.045), (1.0, 0.5, 0.0)),
     "bench_pliers": ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-    "ratchet": ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
     "point_mass": ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
-    "open_wrench": ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
-    "planar_peg": ((0.0, 0.0, -0.045), (1.0, 0.0, 0.0)),
 }
 """Place in m at which a fast hand shakes a scene, and the direction."""
 
@@ -68,12 +55,7 @@ def shakes(name: str, frequency: float, amplitude: float, duration: float = 3.0)
 
 
 def alarms(name: str, motion: Motion | None, grip: Hand | None) -> int:
-    """Runs a hand on a scene; returns the alarms of the watch as flags, 0 for none."""
-    return watch_flags(name, motion, grip) & ALARM
-
-
-def watch_flags(name: str, motion: Motion | None, grip: Hand | None) -> int:
-    """Runs a hand on a scene; returns all flags of the run.
+    """Runs a hand on a scene; returns the alarms of the watch as flags, 0 for none.
 
     Without a motion the scene's own path is followed, by the hand that it asks for.
     """
@@ -81,7 +63,7 @@ def watch_flags(name: str, motion: Motion | None, grip: Hand | None) -> int:
     with hb.Bridge(name, device, clock=hb.SimulatedClock()) as bridge:
         summary = bridge.run(None if motion is None else motion.duration)
         flags = bridge.latest_records(summary.ticks)["flags"]
-    return int(np.bitwise_or.reduce(flags))
+    return int(np.bitwise_or.reduce(flags)) & ALARM
 
 
 class LateInBunches:

@@ -37,36 +37,6 @@ def test_run_prints_the_summary_as_json(call: Called, tmp_path: Path) -> None:
     assert summary["recording"] == str(path)
 
 
-def test_options_of_a_run_reach_the_recording(call: Called, tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    options = {
-        "--rate": 500,
-        "--substeps": 2,
-        "--stiffness": 700,
-        "--damping": 0.25,
-        "--rotational-stiffness": 0.7,
-        "--rotational-damping": 0.0003,
-        "--scale": 1.5,
-        "--force-scale": 0.5,
-        "--force-limit": 3,
-        "--torque-limit": 0.2,
-        "--ramp": 0.01,
-    }
-    flat = [part for pair in options.items() for part in pair]
-    axes = ("--axes", 0, -1, 0, 1, 0, 0, 0, 0, 1)
-    command = ("run", "point_mass", "--fast", "--duration", 0.1, *flat, *axes, "--record", path)
-    code, _, err = call(*command)
-    assert code == 0, err
-    meta = read_recording(path).meta
-    assert float(meta["period_s"]) == 0.002
-    assert (meta["substeps"], meta["ramp_ticks"]) == ("2", "5")
-    for name, value in options.items():
-        key = name[2:].replace("-", "_")
-        if key in meta and key != "ramp":
-            assert float(meta[key]) == value
-    assert json.loads(meta["axes"]) == [0, -1, 0, 1, 0, 0, 0, 0, 1]
-
-
 FELT_WRONG = """<mujoco>
   <compiler angle="degree"/>
   <worldbody>

@@ -44,7 +44,6 @@ from hapticbridge.recording.recorder_process import RunState
 
 @pytest.mark.parametrize("name", LOOP_SCENES)
 def test_random_hands_are_no_alarm(name: str) -> None:
-    """One hand per grip here, 20 with ``scripts/swing_report``."""
     for seed, grip in enumerate(GRIPS.values()):
         assert not alarms(name, random_motion(seed + 9), grip)
 

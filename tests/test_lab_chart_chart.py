@@ -38,7 +38,7 @@ from hapticbridge.lab.chart.output import (
     standing,
     write_chart,
 )
-from hapticbridge.lab.chart.workload import Score, Verdict
+from hapticbridge.lab.chart.score import Score, Verdict
 from hapticbridge.lab.methods import METHODS
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from itertools import count
@@ -19,11 +18,11 @@ from hapticbridge.lab.chart.chart import Chart, Extent, measure_chart, open_work
 from hapticbridge.lab.chart.engine_run import EngineRun, Meter, peer_settings
 from hapticbridge.lab.chart.output import summary_of
 from hapticbridge.lab.chart.peg import JammedPeg
+from hapticbridge.lab.chart.scene_run import Workload
+from hapticbridge.lab.chart.score import PeerWork
 from hapticbridge.lab.chart.setting import OWN, Setting
-from hapticbridge.lab.chart.workload import PeerWork, Workload
 from hapticbridge.lab.engines import mujoco as mujoco_engine
 from hapticbridge.lab.engines.base import (
-    Advised,
     Body,
     Engine,
     FreeBody,
@@ -44,8 +43,14 @@ def workload(name: str) -> Workload:
     return open_workload(name, Extent(GRID, FINE))
 
 
-class Altered:
-    """MuJoCo as a peer, with mistakes planted into its task and its steps.
+def altered(
+    factor: float = 1.0,
+    friction: float = 1.0,
+    *,
+    fails_at: int | None = None,
+    error: type[Exception] = RuntimeError,
+) -> Engine:
+    """Returns MuJoCo as a peer, with mistakes planted into its task and its steps.
 
     Args:
         factor: Of the mass.
@@ -53,36 +58,24 @@ class Altered:
         fails_at: Step in which it raises, at the finer timestep only; never, if None.
         error: What it raises.
     """
+    inner = open_engine("mujoco")
 
-    name = "altered"
-    version = "0"
-    settings: Mapping[str, Advised] = {}
-
-    def __init__(
-        self,
-        factor: float = 1.0,
-        friction: float = 1.0,
-        *,
-        fails_at: int | None = None,
-        error: type[Exception] = RuntimeError,
-    ) -> None:
-        self._inner, self._factor, self._friction = open_engine("mujoco"), factor, friction
-        self._fails_at, self._error = fails_at, error
-
-    def open(self, task: Task, timestep: float) -> Simulation:
-        """Opens the task with another mass and another friction."""
-        mass, friction = self._factor * task.body.mass, self._friction * task.body.friction
-        body = replace(task.body, mass=mass, friction=friction)
-        simulation = self._inner.open(replace(task, body=body), timestep)
+    def opened(task: Task, timestep: float) -> Simulation:
+        body = replace(
+            task.body, mass=factor * task.body.mass, friction=friction * task.body.friction
+        )
+        simulation = inner.open(replace(task, body=body), timestep)
         advance, steps = simulation.advance, count(1)
 
         def failing(force: Vector, torque: Vector) -> None:
-            if next(steps) == self._fails_at and timestep < GRID:
-                raise self._error("no\nconvergence")
+            if next(steps) == fails_at and timestep < GRID:
+                raise error("no\nconvergence")
             advance(force, torque)
 
         simulation.advance = failing  # type: ignore[method-assign]
         return simulation
+
+    return Engine("altered", "0", {}, opened)
 
 
 def score(engine: Engine, name: str, period: float) -> float:
@@ -100,17 +93,17 @@ def test_mujoco_as_a_peer_errs_as_the_held_method_of_the_bridge_does() -> None:
 @pytest.mark.parametrize(
     ("name", "least", "mistake", "most"),
     [
-        ("point_mass", 0.3, Altered(1.2), 1.0),
-        ("point_mass", 0.3, Altered(0.8), 1.0),
-        ("sliding_block", 0.3, Altered(friction=1.2), 2.0),
-        ("sliding_block", 0.3, Altered(friction=0.8), 2.0),
+        ("point_mass", 0.3, altered(1.2), 1.0),
+        ("point_mass", 0.3, altered(0.8), 1.0),
+        ("sliding_block", 0.3, altered(friction=1.2), 2.0),
+        ("sliding_block", 0.3, altered(friction=0.8), 2.0),
         # as the bridge's own: contacts of two steps throw the rod back by a fifth; with the
         # inertia left as it is, or all would fall alike
-        ("rod_impact", 6.0, Altered(0.5), 7.0),
+        ("rod_impact", 6.0, altered(0.5), 7.0),
     ],
 )
 def test_engine_with_a_wrong_mass_or_friction_shows_as_a_worse_point(
-    name: str, least: float, mistake: Altered, most: float
+    name: str, least: float, mistake: Engine, most: float
 ) -> None:
     assert score(open_engine("mujoco"), name, FINE) < least
     assert score(mistake, name, FINE) > most
@@ -231,7 +224,7 @@ def chart_with(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> Chart:
 def test_engine_that_fails_on_the_way_is_a_mark_with_its_reason(
     monkeypatch: pytest.MonkeyPatch, error: type[Exception]
 ) -> None:
-    engine = Altered(fails_at=301, error=error)
+    engine = altered(fails_at=301, error=error)
     chart = chart_with(engine, monkeypatch)
     assert chart.skipped == {}
     whole, broken = (each for each in chart.measurements if each.setting.engine == "altered")
@@ -251,10 +244,10 @@ def test_engine_that_fails_on_the_way_is_a_mark_with_its_reason(
 
 def test_engine_that_fails_while_it_is_timed_loses_those_rounds_alone() -> None:
     setting = Setting(METHODS["explicit"], FINE)
-    run = EngineRun(Altered(), workload("point_mass").peer_work(), setting)
+    run = EngineRun(altered(), workload("point_mass").peer_work(), setting)
     run.scores()
     assert run.run() > 0
-    run.engine = Altered(fails_at=10)
+    run.engine = altered(fails_at=10)
     assert np.isnan(run.run())
 
 
@@ -262,7 +255,7 @@ def test_engine_that_throws_the_tool_away_has_diverged_and_is_timed_as_far_as_it
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # a mass far below what a held force can carry: m > (T/2)(K T/2 + B)
-    chart = chart_with(Altered(1e-3), monkeypatch)
+    chart = chart_with(altered(1e-3), monkeypatch)
     found = [each for each in chart.measurements if each.setting.engine == "altered"]
     assert [each.score.verdict for each in found] == ["diverged", "diverged"]
     assert all(each.score.reason.startswith("the tool was 10 m away after 0.") for each in found)

@@ -16,9 +16,9 @@ from hapticbridge.errors import StudyError
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart import contact_bodies, free_bodies, peg, resting_bodies
 from hapticbridge.lab.chart.chart import Extent, measure_chart, open_workload
-from hapticbridge.lab.chart.scene_run import COUPLING, OwnReferences, SceneRates
+from hapticbridge.lab.chart.scene_run import COUPLING, OwnReferences, SceneRates, Workload
+from hapticbridge.lab.chart.score import Score
 from hapticbridge.lab.chart.setting import Setting, rate_settings
-from hapticbridge.lab.chart.workload import Score, Workload
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import load_scene
 from hapticbridge.theory.impact import ImpactBody, resolve_impact

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +13,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import conditions_of, default_coupling, is_certified
 from hapticbridge.demand.loop_setting import LoopSetting
 from hapticbridge.device import Hand, Motion, SimulatedDevice
-from hapticbridge.errors import DeviceError, StudyError
+from hapticbridge.errors import DeviceError
 from hapticbridge.lab.closed_loop import PARTS, ClosedLoop, LoopOutcome, Timing
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import load_scene
@@ -127,18 +125,6 @@ def test_a_delay_is_as_long_where_the_device_moves_in_parts(
         assert parts.records[name][:count] == pytest.approx(expected, abs=1e-6 * scale)
 
 
-@pytest.mark.parametrize(
-    ("name", "bad"),
-    [
-        *((name, bad) for name in ("jitter", "drops") for bad in (-0.1, 1.0, math.nan, "x", True)),
-        *(("seed", bad) for bad in (-1, 1.5, None)),
-    ],
-)
-def test_timing_out_of_range_is_refused(name: str, bad: Any) -> None:
-    with pytest.raises(StudyError, match=f"{name} is "):
-        Timing(**(asdict(Timing()) | {name: bad}))
-
-
 def test_intervals_are_whole_parts_that_add_up_to_the_time() -> None:
     ticks = 50_000
     jittered = Timing(jitter=0.5, seed=2).intervals(ticks)
@@ -151,23 +137,11 @@ def test_intervals_are_whole_parts_that_add_up_to_the_time() -> None:
     assert np.array_equal(Timing(jitter=0.3, seed=7).intervals(50), Timing(0.3, 0, 7).intervals(50))
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"ticks": 100.5}, "ticks is 100.5"),
-        ({"ticks": 49}, "ticks is 49"),
-        ({"knock": np.zeros(3)}, "knock has shape"),
-        ({"knock": np.full(6, np.nan)}, "knock is nan"),
-        ({"knock": "x"}, "knock is 'x'"),
-        ({"timing": Timing(drops=0.1)}, "at most 6"),
-    ],
-)
-def test_bad_arguments_of_a_run_are_refused(
-    point_mass: ClosedLoop, changes: dict[str, Any], message: str
-) -> None:
-    delay = 7 if "timing" in changes else 0
-    with pytest.raises((StudyError, DeviceError), match=message):
-        point_mass.run(SimulatedDevice(delay=delay), COUPLING, METHODS["implicit"], **changes)
+def test_a_delay_too_long_for_the_parts_of_a_period_is_refused(point_mass: ClosedLoop) -> None:
+    with pytest.raises(DeviceError, match="at most 6"):
+        point_mass.run(
+            SimulatedDevice(delay=7), COUPLING, METHODS["implicit"], timing=Timing(drops=0.1)
+        )
 
 
 @pytest.mark.parametrize(

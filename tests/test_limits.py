@@ -49,7 +49,7 @@ def check_end(done: subprocess.CompletedProcess[str], record: Path) -> bool:
     return False
 
 
-@pytest.mark.parametrize("size", [NEEDED // 16, NEEDED // 4, NEEDED // 2, NEEDED - 1, NEEDED])
+@pytest.mark.parametrize("size", [NEEDED // 16, NEEDED - 1, NEEDED])
 def test_too_little_memory_is_one_sentence(tmp_path: Path, size: int) -> None:
     record = tmp_path / "run.mcap"
     done = run_under(resource.RLIMIT_AS, size, record)
@@ -66,7 +66,7 @@ def test_too_few_files_are_one_sentence(tmp_path: Path, count: int) -> None:
         assert "'ulimit -n' allows" in done.stderr
 
 
-@pytest.mark.parametrize("size", [0, 10_000, 1_000_000, 4_000_000, 20_000_000])
+@pytest.mark.parametrize("size", [0, 4_000_000, 20_000_000])
 def test_too_small_files_are_one_sentence(tmp_path: Path, size: int) -> None:
     record = tmp_path / "run.mcap"
     done = run_under(resource.RLIMIT_FSIZE, size, record)
@@ -160,7 +160,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", place], check=False, capture_output=True)
 
 
-@pytest.mark.parametrize("size", [200, 400, 1000, 2000, 4000, 4300, 4500, 6000, 20000])
+@pytest.mark.parametrize("size", [200, 4000, 4300, 4500, 6000])
 def test_a_small_disk_is_refused_or_holds_a_whole_recording(disk: Path, size: int) -> None:
     mount = ["mount", "-t", "tmpfs", "-o", f"size={size}k", "none", str(disk)]
     if subprocess.run(mount, check=False, capture_output=True).returncode:

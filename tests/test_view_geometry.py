@@ -25,7 +25,7 @@ from hapticbridge.view.geometry import (
     props_of,
     shell,
 )
-from hapticbridge.view.page import MAX_ARROW, Ghost, Sight
+from hapticbridge.view.page import MAX_ARROW, Ghost, Held
 
 Array = NDArray[np.float64]
 
@@ -158,22 +158,6 @@ TOOL = """<mujoco>
 </mujoco>"""
 
 
-def sight(handle: tuple[float, float, float], force: tuple[float, float, float]) -> Sight:
-    one, nothing = np.array([1.0, 0, 0, 0]), np.zeros((0, 3))
-    return Sight(
-        time=0.0,
-        places=nothing,
-        turns=np.zeros((0, 4)),
-        handle=np.array(handle),
-        handle_turn=one,
-        grip=np.zeros(3),
-        hand_force=np.array(force),
-        tool_force=-np.array(force) / 0.3,
-        contact_places=nothing,
-        contact_forces=nothing,
-    )
-
-
 def test_the_ghost_is_all_of_the_tool_that_is_seen_and_a_little_larger() -> None:
     model = mujoco.MjModel.from_xml_string(TOOL)
     found = shell(model, "grip")
@@ -192,7 +176,15 @@ def test_the_ghost_is_all_of_the_tool_that_is_seen_and_a_little_larger() -> None
 def test_spring_and_arrow_point_to_where_the_hand_is_pulled(stretch: float) -> None:
     canvas: Any = Canvas()
     ghost = Ghost(canvas, Scenery.from_model(mujoco.MjModel.from_xml_string(TOOL), "grip"))
-    seen = sight((0, 0, -stretch), (0, 0, 5.0))  # pushed down, the tool is above
+    force = np.array([0.0, 0.0, 5.0])
+    # pushed down, the tool is above
+    seen = Held(
+        handle=np.array([0.0, 0.0, -stretch]),
+        handle_turn=np.array([1.0, 0.0, 0.0, 0.0]),
+        grip=np.zeros(3),
+        hand_force=force,
+        tool_force=-force / 0.3,
+    )
     ghost.show(seen, 10.0, 20.0)
     line = canvas.__dict__["/coupling"].points
     start, end = line[0, 0], line[-1, 1]

@@ -26,7 +26,7 @@ pytest.importorskip("viser", reason="needs the extra 'view'")
 
 
 from hapticbridge.view.geometry import Tendons
-from hapticbridge.view.page import Ghost, Sight
+from hapticbridge.view.page import Ghost, Held, Sight
 from hapticbridge.view.process import LiveRun, run_of
 from hapticbridge.view.replay import Replay
 
@@ -104,15 +104,17 @@ def test_a_live_view_has_every_body_where_the_run_simulated_again_has_it(
     lift = stage.model.body("lift").id
     for sight in sights:
         stage.show(stage.tick_at(sight.time))
-        seen = stage.contacts(), stage.hand_force
-        again = Sight.from_scene(stage.model, stage.data, stage.row, Tendons(stage.model), *seen)
+        hands = tuple(Held.from_record(*each) for each in stage.hands())
+        seen = stage.contacts(), stage.row, hands
+        again = Sight.from_scene(stage.model, stage.data, Tendons(stage.model), *seen)
         assert sight.time == again.time
         np.testing.assert_array_equal(sight.places, again.places)
         np.testing.assert_array_equal(sight.turns, again.turns)
         np.testing.assert_array_equal(sight.contact_places, again.contact_places)
         np.testing.assert_allclose(sight.contact_forces, again.contact_forces, atol=1e-12)
-        np.testing.assert_array_equal(sight.grip, again.grip)
-        np.testing.assert_array_equal(sight.hand_force, again.hand_force)
+        (held,), (expected,) = sight.hands, again.hands
+        np.testing.assert_array_equal(held.grip, expected.grip)
+        np.testing.assert_array_equal(held.hand_force, expected.hand_force)
         assert np.linalg.norm(sight.contact_forces, axis=1).all()
         touched += len(sight.contact_places) > 0
     assert touched > 5
@@ -139,13 +141,14 @@ def test_a_live_view_shows_every_hand_that_has_a_handle(tmp_path: Path, scene: s
     assert len(sights) > 15
     first, second = (hb.read_recording(path, hand=each).ticks for each in (0, 1))
     assert watcher.live is not None
-    has_others = scene == "bar"
-    assert len(watcher.live.scenery.other_tools) == has_others
+    count = 2 if scene == "bar" else 1
+    assert len(watcher.live.scenery.tools) == count
     for sight in sights:
         tick = int(np.searchsorted(first["deadline_ns"], round(1e9 * sight.time)))
-        assert sight.handle.tolist() == first["handle_position"][tick].tolist()
-        assert len(sight.others) == has_others
-        for other in sight.others:
+        own, *others = sight.hands
+        assert own.handle.tolist() == first["handle_position"][tick].tolist()
+        assert len(sight.hands) == count
+        for other in others:
             assert other.handle.tolist() == second["handle_position"][tick].tolist()
             assert other.tool_force.tolist() == second["wrench_on_tool"][tick, :3].tolist()
             assert other.hand_force == pytest.approx(second["wrench_on_device"][tick, :3])
@@ -153,7 +156,7 @@ def test_a_live_view_shows_every_hand_that_has_a_handle(tmp_path: Path, scene: s
     at = np.searchsorted(first["deadline_ns"], np.round(1e9 * time).astype(np.int64))
     np.testing.assert_allclose(lines[3], 1e3 * first["device_energy"][at])
     replay = Replay(path, in_process=True)
-    assert len(replay.sights[-1].others) == has_others
+    assert len(replay.sights[-1].hands) == count
     for hand, held in enumerate(replay.sights[-1].hands):
         canvas: Any = Canvas()
         Ghost(canvas, replay.scenery, hand).show(held, 1.0, 1.0)

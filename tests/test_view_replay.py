@@ -57,13 +57,17 @@ def test_sights_stand_where_the_record_says_and_contacts_carry_the_force(replay:
         sight = replay.sight_at(moment)
         row = records[max(round(sight.time * 1000) - 1, 0)]
         np.testing.assert_allclose(sight.places[ball], row["tool_position"], atol=1e-9)
-        np.testing.assert_allclose(sight.handle, row["handle_position"])
+        np.testing.assert_allclose(sight.hands[0].handle, row["handle_position"])
     still = replay.sight_at(1.1)  # before a handle that stands still is probed
-    assert np.linalg.norm(still.hand_force) > 1
-    np.testing.assert_allclose(still.hand_force, -still.tool_force)  # as force_scale is 1
+    assert np.linalg.norm(still.hands[0].hand_force) > 1
+    np.testing.assert_allclose(
+        still.hands[0].hand_force, -still.hands[0].tool_force
+    )  # as force_scale is 1
     assert len(still.contact_places) == 1
     # at rest what the coupling pushes the floor gives back
-    np.testing.assert_allclose(still.contact_forces.sum(axis=0), -still.tool_force, atol=2e-2)
+    np.testing.assert_allclose(
+        still.contact_forces.sum(axis=0), -still.hands[0].tool_force, atol=2e-2
+    )
     assert not len(replay.sight_at(0.0).contact_places)
 
 

@@ -13,7 +13,7 @@ from hapticbridge.errors import StudyError, choices
 from hapticbridge.lab.chart.chart import MIN_REPEATS, REPEATS, Extent, measure_chart, open_workload
 from hapticbridge.lab.chart.engine_run import peer_settings
 from hapticbridge.lab.chart.output import ChartFiles, draw_chart, prepared_files, write_chart
-from hapticbridge.lab.chart.scene_run import SceneRates
+from hapticbridge.lab.chart.scene_run import SceneRates, Workload
 from hapticbridge.lab.chart.setting import (
     Setting,
     chosen_methods,
@@ -21,7 +21,6 @@ from hapticbridge.lab.chart.setting import (
     rate_settings,
     settings_for,
 )
-from hapticbridge.lab.chart.workload import Workload
 from hapticbridge.lab.engines.base import available_engines, caught_prints, open_engine
 from hapticbridge.lab.maps import MAPS, MapFiles, StabilityMap, run_map
 from hapticbridge.plotting import check_ending

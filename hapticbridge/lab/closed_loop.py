@@ -16,13 +16,11 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import Method, prepare, resolve_contact_stiffness
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.simulated.dynamics import STATE_DTYPE as DEVICE_DTYPE
 from hapticbridge.device.simulated.dynamics import next_sample
-from hapticbridge.errors import StudyError
 from hapticbridge.kernel.codes import State
 from hapticbridge.kernel.jit import compiled, compiled_for_threads, direct
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at, without_timers
@@ -38,8 +36,6 @@ PARTS = 16
 """Number of parts of a period in which jitter is counted. The device is exact between any two of
 them. More parts resolve jitter finer and cost a device step each."""
 
-_TIMING_ARGUMENTS = Arguments(StudyError)
-
 
 @dataclass(frozen=True, slots=True)
 class Timing:
@@ -51,22 +47,11 @@ class Timing:
             tick is late.
         drops: Share of ticks that are missed, 0 <= drops < 1. The last wrench is then held.
         seed: Seed of the random numbers.
-
-    Raises:
-        StudyError: A value is no number or out of range.
     """
 
     jitter: float = 0.0
     drops: float = 0.0
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("jitter", "drops"):
-            value = _TIMING_ARGUMENTS.number(name, getattr(self, name), least=0.0)
-            if not value < 1:
-                raise StudyError(f"{name} is {value!r}; it must be a share, 0 <= {name} < 1")
-            object.__setattr__(self, name, value)
-        _TIMING_ARGUMENTS.whole("seed", self.seed, least=0, most=2**63 - 1)
 
     @property
     def is_even(self) -> bool:
@@ -92,15 +77,6 @@ on accelerations (1e10 in SI units) warns and resets."""
 FLOOR = 1e-6
 """Signal in N that counts as zero. MuJoCo's solver leaves 3e-8 N on a free mass at its default
 tolerance, whatever the motion."""
-
-MIN_TICKS = 50
-"""Smallest number of ticks of a run. A fifth of it is the window in which a decay is looked for,
-and ten samples are the fewest that show one."""
-
-MAX_TICKS = 10**9
-"""Largest number of ticks of a run. Beyond it the signal alone would not fit into memory."""
-
-_ARGUMENTS = Arguments(StudyError)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,22 +150,17 @@ class ClosedLoop:
             coupling: K and B.
             method: Rendering method.
             period: T in s.
-            ticks: Number of ticks, >= 50.
+            ticks: Number of ticks, >= 50: a fifth of them is the window in which a decay is looked
+                for, and ten samples are the fewest that show one.
             substeps: MuJoCo steps per tick.
             scene_ticks: Ticks between two results of a slower scene; 0 steps it in every tick.
-            knock: Displacement of the device before the first tick, shape (6,), in m and rad; no
-                number is beyond 1e30.
+            knock: Displacement of the device before the first tick, shape (6,), in m and rad.
             timing: Late and missed ticks; None: every one on time.
             keep_records: True returns the records.
 
         Raises:
             HapticBridgeError: A value is out of range, or the method cannot render the scene.
         """
-        _ARGUMENTS.whole("ticks", ticks, least=MIN_TICKS, most=MAX_TICKS)
-        if knock is not None:
-            knock = _ARGUMENTS.numbers("knock", knock, "m or rad")
-            if knock.shape != (6,):
-                raise StudyError(f"knock has shape {knock.shape}; it must be 6 numbers")
         scene = self.scene
         scene_period = max(scene_ticks, 1) * period
         effective = prepare(scene, coupling, scene_period, substeps, method, warns=False)

@@ -263,13 +263,13 @@ class Stage:
         return np.asarray(force * self._is_held[hand])
 
     @property
-    def other_grips(self) -> tuple[str, ...]:
-        """Grips of the further hands; a joint has no place in the scene."""
-        return tuple(own.grip for own in self._hands[1:] if not own.is_joint)
+    def grips(self) -> tuple[str, ...]:
+        """Grips of the hands; a joint has no place in the scene."""
+        return tuple(own.grip for own in self._hands if not own.is_joint)
 
-    def others(self) -> Iterator[tuple[NDArray[np.void], NDArray[np.float64]]]:
-        """Yields the record (1,) of each further hand, and the force on it in N, (3,)."""
-        for hand, own in enumerate(self._hands[1:], 1):
+    def hands(self) -> Iterator[tuple[NDArray[np.void], NDArray[np.float64]]]:
+        """Yields the record (1,) of each hand at a grip, and the force on it in N, (3,)."""
+        for hand, own in enumerate(self._hands):
             if not own.is_joint:
                 yield self.rows[hand : hand + 1], self._force_on(hand)
 

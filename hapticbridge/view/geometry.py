@@ -288,10 +288,9 @@ class Scenery:
         props: Visible geoms.
         widths: Diameter of each visible tendon in m, (n,).
         colours: Colour of each visible tendon, 0 to 1, (n, 4).
-        tool: Shell around the tool (``shell``).
+        tools: Shell around the tool of each hand (``shell``).
         is_always_implicit: True if the method falls back in every tick
             (``summary.is_always_implicit``).
-        other_tools: Shells around the tools of further hands.
     """
 
     bodies: int
@@ -300,12 +299,11 @@ class Scenery:
     props: list[Prop]
     widths: Array
     colours: Array
-    tool: trimesh.Trimesh
+    tools: tuple[trimesh.Trimesh, ...]
     is_always_implicit: bool
-    other_tools: tuple[trimesh.Trimesh, ...] = ()
 
     @classmethod
-    def from_model(cls, model: mujoco.MjModel, grip: str, *others: str) -> Scenery:
+    def from_model(cls, model: mujoco.MjModel, *grips: str) -> Scenery:
         """Returns what is drawn of a scene; grips are names of sites on the tools."""
         tendons = Tendons(model)
         return cls(
@@ -315,17 +313,15 @@ class Scenery:
             props=props_of(model),
             widths=tendons.widths,
             colours=tendons.colours,
-            tool=shell(model, grip),
-            is_always_implicit=is_always_implicit(model, grip),
-            other_tools=tuple(shell(model, other) for other in others),
+            tools=tuple(shell(model, grip) for grip in grips),
+            is_always_implicit=is_always_implicit(model, grips[0]),
         )
 
     def parts(self) -> dict[str, Any]:
         """Returns numbers, texts and arrays from which ``from_parts`` makes an equal one."""
         names = ("bodies", "extent", "centre", "widths", "colours", "is_always_implicit")
         return {name: getattr(self, name) for name in names} | {
-            "tool": _surface(self.tool),
-            "other_tools": [_surface(each) for each in self.other_tools],
+            "tools": [_surface(each) for each in self.tools],
             "props": [
                 [each.body, each.place, each.turn, each.colour, *_surface(each.mesh)]
                 for each in self.props
@@ -351,6 +347,7 @@ class Scenery:
                 )
                 for body, place, turn, colour, *surface in parts["props"]
             ]
+            first, *others = parts["tools"]  # one at least
             return cls(
                 bodies=bodies,
                 extent=float(checked(np.array(parts["extent"]))),
@@ -358,9 +355,8 @@ class Scenery:
                 props=props,
                 widths=checked(parts["widths"], count),
                 colours=checked(parts["colours"], count, 4),
-                tool=_mesh(*parts["tool"]),
+                tools=tuple(_mesh(*each) for each in (first, *others)),
                 is_always_implicit=bool(parts["is_always_implicit"]),
-                other_tools=tuple(_mesh(*each) for each in parts["other_tools"]),
             )
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise RecordingError(f"the scene cannot be drawn: {error}") from None

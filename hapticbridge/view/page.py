@@ -76,7 +76,15 @@ _BLUE, _HAND = (26, 95, 180), (230, 97, 0)
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """Handle and forces of a further hand at one instant; attributes as those of ``Sight``."""
+    """Handle and forces of a hand at one instant, in world coordinates.
+
+    Attributes:
+        handle: Position of the handle, (3,) in m.
+        handle_turn: Orientation of the handle, a quaternion (4,).
+        grip: Position of the grip on the tool, (3,) in m.
+        hand_force: Force of the device on the hand, (3,) in N; zero without a hand.
+        tool_force: Force of the coupling on the tool, (3,) in N.
+    """
 
     handle: Array
     handle_turn: Array
@@ -86,7 +94,10 @@ class Held:
 
     @classmethod
     def from_record(cls, row: NDArray[np.void], hand_force: Array) -> Held:
-        """Returns what a record, one element of ``TICK_DTYPE``, says of a hand."""
+        """Returns what a record, one element of ``TICK_DTYPE``, says of a hand.
+
+        ``hand_force`` is the force of the device on the hand in the world frame, (3,) in N.
+        """
         return cls(
             handle=row["handle_position"][0].copy(),
             handle_turn=row["handle_quaternion"][0].copy(),
@@ -104,30 +115,20 @@ class Sight:
         time: Time of the run's clock in s at which the tick was due.
         places: Positions of the bodies, (nbody, 3) in m.
         turns: Orientations of the bodies, quaternions (nbody, 4).
-        handle: Position of the handle, (3,) in m.
-        handle_turn: Orientation of the handle, a quaternion (4,).
-        grip: Position of the grip on the tool, (3,) in m.
-        hand_force: Force of the device on the hand, (3,) in N; zero without a hand.
-        tool_force: Force of the coupling on the tool, (3,) in N.
         contact_places: Positions of the contacts with a force, (n, 3) in m.
         contact_forces: Forces of the contacts, (n, 3) in N.
         tendons: Straight pieces of each visible tendon, (m, 2, 3) in m.
-        others: Further hands with a handle in the scene; a grip axis has none.
+        hands: All hands with a handle in the scene, the first one first; a grip axis has none.
         blow: Newest blow of the tool so far; None before the first.
     """
 
     time: float
     places: Array
     turns: Array
-    handle: Array
-    handle_turn: Array
-    grip: Array
-    hand_force: Array
-    tool_force: Array
     contact_places: Array
     contact_forces: Array
-    tendons: tuple[NDArray[np.float32], ...] = ()
-    others: tuple[Held, ...] = ()
+    tendons: tuple[NDArray[np.float32], ...]
+    hands: tuple[Held, ...]
     blow: NewestBlow | None = None
 
     @classmethod
@@ -135,67 +136,51 @@ class Sight:
         cls,
         model: mujoco.MjModel,
         data: mujoco.MjData,
-        row: NDArray[np.void],
         tendons: Tendons,
         contacts: Array,
-        hand_force: Array,
+        row: NDArray[np.void],
+        hands: tuple[Held, ...],
     ) -> Sight:
         """Returns the instant of a scene.
 
         Args:
             model: The scene.
             data: Positions after the tick; the poses of bodies are computed here.
-            row: Record of the tick, one element of ``TICK_DTYPE``.
             tendons: Tendons of the scene.
             contacts: Position in m and force in N of each contact with a force, (n, 2, 3).
-            hand_force: Force of the device on the hand in the world frame, (3,) in N.
+            row: Record of the tick, one element of ``TICK_DTYPE``.
+            hands: Hands at the instant.
         """
         mujoco.mj_kinematics(model, data)
         return cls(
             time=1e-9 * float(row["deadline_ns"][0]),
             places=data.xpos.copy(),
             turns=data.xquat.copy(),
-            handle=row["handle_position"][0].copy(),
-            handle_turn=row["handle_quaternion"][0].copy(),
-            grip=row["tool_position"][0].copy(),
-            hand_force=hand_force.copy(),
-            tool_force=row["wrench_on_tool"][0, :3].copy(),
             contact_places=contacts[:, 0],
             contact_forces=contacts[:, 1],
             tendons=tendons.pieces(data),
+            hands=hands,
         )
-
-    @property
-    def hands(self) -> tuple[Sight | Held, ...]:
-        """All hands with a handle in the scene."""
-        return self, *self.others
 
     def parts(self) -> list[Any]:
         """Returns numbers and arrays from which ``from_parts`` makes an equal one."""
-        *own, others, blow = [getattr(self, field.name) for field in fields(self)]
-        held = [[getattr(each, field.name) for field in fields(each)] for each in others]
+        *own, hands, blow = [getattr(self, field.name) for field in fields(self)]
+        held = [[getattr(each, field.name) for field in fields(each)] for each in hands]
         return [*own, held, None if blow is None else blow.parts()]
 
     @classmethod
-    def from_parts(cls, parts: Any, bodies: int, tendons: int, others: int = 0) -> Sight:
+    def from_parts(cls, parts: Any, bodies: int, tendons: int, hands: int = 1) -> Sight:
         """Returns an instant from the numbers of a process that may have been taken over.
 
         Raises:
-            RecordingError: They are no instant of a scene of so many bodies, tendons and further
-                hands.
+            RecordingError: They are no instant of a scene of so many bodies, tendons and hands.
         """
         try:
-            time, places, turns, handle, handle_turn, grip, hand, tool, where, forces, *rest = parts
-            lines, held, blow = rest
+            time, places, turns, where, forces, lines, held, blow = parts
             return cls(
                 float(checked(np.array(time))),
                 checked(places, bodies, 3),
                 checked(turns, bodies, 4),
-                checked(handle, 3),
-                checked(handle_turn, 4),
-                checked(grip, 3),
-                checked(hand, 3),
-                checked(tool, 3),
                 checked(where, None, 3),
                 checked(forces, len(where), 3),
                 tuple(
@@ -204,7 +189,7 @@ class Sight:
                 ),
                 tuple(
                     Held(*(checked(own, n) for own, n in zip(each, (3, 4, 3, 3, 3), strict=True)))
-                    for each, _ in zip(held, range(others), strict=True)
+                    for each, _ in zip(held, range(hands), strict=True)
                 ),
                 None if blow is None else NewestBlow.from_parts(checked(blow, 7)),
             )
@@ -301,7 +286,7 @@ class Ghost:
 
     def __init__(self, scene: viser.SceneApi, scenery: Scenery, hand: int = 0) -> None:
         self._extent = extent = scenery.extent
-        self._shell = (scenery.tool, *scenery.other_tools)[hand]
+        self._shell = scenery.tools[hand]
         own = f" {hand + 1}" if hand else ""
         self._longest, self.times = 0.0, 1
         self._handle = scene.add_frame(f"/handle{own}", show_axes=False)
@@ -327,27 +312,27 @@ class Ghost:
         self._longest = max(self._longest, stretch)
         self.times = enlargement(FARTHEST * self._extent, self._longest)
 
-    def show(self, sight: Sight | Held, hand_reference: float, tool_reference: float) -> None:
+    def show(self, held: Held, hand_reference: float, tool_reference: float) -> None:
         """Draws an instant.
 
         Args:
-            sight: The instant, or that of a further hand.
+            held: The hand at that instant.
             hand_reference: The force on the hand in N that is drawn longest, > 0.
             tool_reference: The force on the tool in N at which the spring is reddest, > 0.
         """
-        strength = float(np.linalg.norm(sight.hand_force))
-        way = sight.grip - sight.handle
+        strength = float(np.linalg.norm(held.hand_force))
+        way = held.grip - held.handle
         stretch = float(np.linalg.norm(way))
         self.allow(stretch)
-        self._handle.position, self._handle.wxyz = sight.handle, sight.handle_turn
+        self._handle.position, self._handle.wxyz = held.handle, held.handle_turn
         colour = linear(
-            255.0 * force_colour(float(np.linalg.norm(sight.tool_force)), tool_reference)
+            255.0 * force_colour(float(np.linalg.norm(held.tool_force)), tool_reference)
         )
         # it begins on the ghost's surface, unless it truly ends at the tool
-        start = sight.handle
+        start = held.handle
         if self.times > 1 and stretch > 0.0:
             along = way / stretch
-            aside = self._surfaces.way_out(matrix_of(sight.handle_turn).T @ along)
+            aside = self._surfaces.way_out(matrix_of(held.handle_turn).T @ along)
             start = start + aside * along
         end = start + self.times * way
         self._spring.points = coil(start, end, 0.02 * self._extent).astype(np.float32)
@@ -355,7 +340,7 @@ class Ghost:
         self._arrow.visible = strength > 1e-3 * hand_reference
         if self._arrow.visible:
             reach = MAX_ARROW * self._extent / max(hand_reference, strength)
-            points = np.array([[end, end + reach * sight.hand_force]])
+            points = np.array([[end, end + reach * held.hand_force]])
             self._arrow.points = points.astype(np.float32)
 
 
@@ -407,9 +392,7 @@ class Page:
         self.hand_reference = self.tool_reference = MIN_REFERENCE
         self._extent, self._strongest = scenery.extent, 0.0
         self._build_scene(scenery)
-        self._ghosts = [
-            Ghost(server.scene, scenery, hand) for hand in range(1 + len(scenery.other_tools))
-        ]
+        self._ghosts = [Ghost(server.scene, scenery, hand) for hand in range(len(scenery.tools))]
         server.gui.set_panel_label(printable(f"hapticbridge: {facts.get('scene', '')}"))
         self.status = server.gui.add_markdown("waiting for the first tick")
         self._caption = _caption(scenery, parameters, facts)
@@ -491,8 +474,9 @@ class Page:
         The force on the tool is named where it differs from that on the hand. Of several hands,
         those of the first; the pictures show all.
         """
-        hand = float(np.linalg.norm(sight.hand_force)) if self._is_held else None
-        forces = format_forces(hand, float(np.linalg.norm(sight.tool_force)))
+        held = sight.hands[0]
+        hand = float(np.linalg.norm(held.hand_force)) if self._is_held else None
+        forces = format_forces(hand, float(np.linalg.norm(held.tool_force)))
         return forces if sight.blow is None else f"{forces}; {sight.blow.words}"
 
     def plot(self, time: Array, lines: Sequence[Array]) -> None:

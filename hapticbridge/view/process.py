@@ -86,9 +86,8 @@ class LiveRun:
         self._ring, self._snapshot = ring, Snapshot.attach(snapshot, self.model)
         self._data, self._tendons = mujoco.MjData(self.model), Tendons(self.model)
         self._gathered, self._shown = 0, -1
-        self._is_held = is_held(run.meta)
-        self._are_held = [self._is_held, *map(is_held, metas)]
-        self.trace = Trace(TRACE, is_held=self._is_held)
+        self._are_held = [is_held(meta) for meta in (run.meta, *metas)]
+        self.trace = Trace(TRACE, is_held=self._are_held[0])
         self.hand_reference = self.tool_reference = MIN_REFERENCE
         self.flags = 0
         self.blow: NewestBlow | None = None
@@ -105,20 +104,20 @@ class LiveRun:
         self._gather(picture)
         self._data.qpos[:] = picture.qpos
         self._data.mocap_pos[:], self._data.mocap_quat[:] = picture.mocap_pos, picture.mocap_quat
-        force = force_on_hand(rows[:1], self.parameters.axes)[0] * self._is_held
+        hands = tuple(self._hands_at(rows))
         sight = Sight.from_scene(
-            self.model, self._data, rows[:1], self._tendons, picture.contacts, force
+            self.model, self._data, self._tendons, picture.contacts, rows[:1], hands
         )
-        sight = replace(sight, others=tuple(self._others(rows)), blow=self.blow)
-        for held in sight.hands:
+        sight = replace(sight, blow=self.blow)
+        for held in hands:
             size, pull = np.linalg.norm(held.hand_force), np.linalg.norm(held.tool_force)
             self.hand_reference = max(self.hand_reference, float(size))
             self.tool_reference = max(self.tool_reference, float(pull))
         return sight
 
-    def _others(self, rows: NDArray[np.void]) -> Iterator[Held]:
-        """Yields the further hands of a tick; a joint has no handle in the scene."""
-        for hand, own in enumerate(self._hands[1:], 1):
+    def _hands_at(self, rows: NDArray[np.void]) -> Iterator[Held]:
+        """Yields the hands at a tick; a joint has no handle in the scene."""
+        for hand, own in enumerate(self._hands):
             if not own.is_joint:
                 row = rows[hand : hand + 1]
                 yield Held.from_record(row, force_on_hand(row, own.axes)[0] * self._are_held[hand])

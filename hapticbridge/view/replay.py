@@ -91,7 +91,7 @@ class Replay:
             return
         instant, point = message
         scenery = self.scenery
-        counts = scenery.bodies, len(scenery.widths), len(scenery.other_tools)
+        counts = scenery.bodies, len(scenery.widths), len(scenery.tools)
         sight = Sight.from_parts(instant, *counts)
         self.sights.append(sight)
         self.trace.add_point(point)
@@ -110,18 +110,18 @@ def _played(recording: RecordingFile, worker: Worker) -> None:
     stage = Stage(recording, worker.allow_run)
     step = max(FRAME, stage.duration / MOST)
     count = max(1, int(stage.duration / step) + 1)
-    scenery = Scenery.from_model(stage.model, stage.parameters.grip, *stage.other_grips).parts()
+    scenery = Scenery.from_model(stage.model, *stage.grips).parts()
     references = {"on_hand": stage.hand_reference, "on_tool": stage.tool_reference}
     worker.tell(scenery | references | {"step": step, "count": count})
     tendons, trace = Tendons(stage.model), Trace(is_held=is_held(stage.recording.meta))
     for number in range(count):
         stage.show(stage.tick_at(min(number * step, stage.duration)))
         trace.add(stage.passed, stage.slack)
+        hands = tuple(Held.from_record(*each) for each in stage.hands())
         sight = Sight.from_scene(
-            stage.model, stage.data, stage.row, tendons, stage.contacts(), stage.hand_force
+            stage.model, stage.data, tendons, stage.contacts(), stage.row, hands
         )
-        others = tuple(Held.from_record(*each) for each in stage.others())
-        sight = replace(sight, others=others, blow=stage.blow)
+        sight = replace(sight, blow=stage.blow)
         worker.tell([sight.parts(), trace.newest])
 
 

@@ -76,8 +76,8 @@ from hapticbridge.lab.chart.peg import (
     resting_peg,
 )
 from hapticbridge.lab.chart.scene_run import Prepared, path_of
+from hapticbridge.lab.chart.score import PASSIVE, Take
 from hapticbridge.lab.chart.setting import SPRING, Setting, chosen_periods
-from hapticbridge.lab.chart.workload import PASSIVE, Take
 from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.base import (
     ENGINES,

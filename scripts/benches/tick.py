@@ -12,10 +12,6 @@ them off.
 The bridge runs as it does by default, pipelined, and once more plain. "sample to wrench 0.80 x" is
 the time that the device waits over bare ``mj_step``; what the pipeline leaves of it stands behind.
 
-``--hands`` compares two hands with one instead, in a scene of two bodies that float: "two hands
-1.20 x" is a tick of two hands, a body each, over a tick of one hand that holds the first. Both
-bridges run in one process, block by block in turn, with the method of two hands.
-
 ``--against CHECKOUT`` compares this checkout with another one instead: "NAME tick 1.01 x" is what a
 tick costs here over what it costs there. In each pass either has a fresh process of its own, its
 own ``.venv`` if it has one and its own ``scripts/tick_blocks.py`` if it has that; both are pinned
@@ -46,7 +42,7 @@ from measuring import in_turn, interval
 from numpy.typing import NDArray
 from tick_blocks import BLOCK, UnpacedClock
 
-from hapticbridge import Bridge, Grasp, Scene, load_scene
+from hapticbridge import Bridge, load_scene
 from hapticbridge.demand.methods import prepare
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.record import SAMPLE_DTYPE
@@ -258,50 +254,10 @@ def compare_checkouts(other: Path, passes: int, scenes: Sequence[str]) -> dict[s
     return {" ".join(key): values for key, values in kept.items()}
 
 
-def compare_hands(passes: int) -> dict[str, list[float]]:
-    """Prints what a tick of two hands costs over one of one hand in the same scene."""
-    kept: list[float] = []
-    for k in range(passes):
-        with ExitStack() as stack:
-            one, two = (
-                stack.enter_context(
-                    Bridge(_two_bodies(grips), device, method="implicit", clock=UnpacedClock())
-                )
-                for grips, device in (
-                    ("a", "simulated"),
-                    (("a", "b"), [Grasp("a"), Grasp("b")]),
-                )
-            )
-            ratios = []
-            for block in range(round(MOTION / one.period) // BLOCK):
-                times = {}
-                for bridge in (one, two) if (block + k) % 2 else (two, one):
-                    bridge.run(BLOCK * bridge.period)
-                    count = len(bridge.setups)
-                    rows = bridge.latest_records(BLOCK * count)[::count]
-                    times[bridge] = np.median(np.diff(rows["wake_ns"]))
-                if block:  # the first one warms up
-                    ratios.append(times[two] / times[one])
-        kept.append(float(np.median(ratios)))
-    print(f"two hands {interval(kept)}")
-    return {"two hands": kept}
-
-
-def _two_bodies(grips: str | tuple[str, ...]) -> Scene:
-    spec = mujoco.MjSpec()
-    spec.option.timestep, spec.option.gravity = 1e-3, [0, 0, 0]
-    for name, place in (("a", 0.0), ("b", 0.3)):
-        body = spec.worldbody.add_body(name=name, pos=[place, 0, 0])
-        body.add_freejoint()
-        body.add_geom(size=[0.02, 0, 0], mass=0.1)
-    return load_scene(spec, grips)
-
-
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Adds the number of passes, and the two comparisons."""
+    """Adds the number of passes, the scenes and the checkout to compare with."""
     parser.add_argument("--passes", type=whole, default=6, help="passes over each hand path")
     parser.add_argument("--against", type=Path, help="checkout to compare this one with")
-    parser.add_argument("--hands", action="store_true", help="compare two hands with one")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=[*SCENES], help="only these")
 
 
@@ -309,8 +265,6 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Prints the costs; returns them."""
     if options.against is not None:
         return compare_checkouts(options.against.resolve(), options.passes, options.scenes)
-    if options.hands:
-        return compare_hands(options.passes)
     reading, found = clock_cost(), {}
     for name in options.scenes:
         ways = {

@@ -18,8 +18,9 @@ from hapticbridge.errors import HapticBridgeError, StudyError
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.lab.chart import contact_bodies, free_bodies, peg, resting_bodies, scene_run
 from hapticbridge.lab.chart.engine_run import EngineRun
+from hapticbridge.lab.chart.scene_run import Workload
+from hapticbridge.lab.chart.score import PASSIVE, Panel, PeerWork, Run, Score
 from hapticbridge.lab.chart.setting import OWN, Setting, simulator_name
-from hapticbridge.lab.chart.workload import PASSIVE, Panel, PeerWork, Run, Score, Workload
 from hapticbridge.lab.engines.base import Engine, open_engine
 from hapticbridge.run.description import processor
 
@@ -208,7 +209,7 @@ class Measurement:
         score: Errors.
         chosen: Contacts and solver of the engine, by name.
         limit_apart: Where errors are counted from each method's own limit: the distance in JND of
-            that limit from the central one (``References``). 0 where they are counted from the
+            that limit from the central one (``OwnReferences``). 0 where they are counted from the
             truth.
     """
 

@@ -22,8 +22,8 @@ from hapticbridge.kernel.pose import quaternion_exp
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import motion_along
 from hapticbridge.lab.chart.free_bodies import still
-from hapticbridge.lab.chart.scene_run import Prepared, Staged, Stages
-from hapticbridge.lab.chart.workload import (
+from hapticbridge.lab.chart.scene_run import Prepared, Stages, Workload
+from hapticbridge.lab.chart.score import (
     Panel,
     PeerWork,
     Score,
@@ -176,7 +176,7 @@ def exact_sliding(
     return handle_place(times) - stretch, k * stretch + b * rate
 
 
-class SlidingBlock(Staged):
+class SlidingBlock(Workload):
     """The sliding block as a workload.
 
     Args:
@@ -344,7 +344,7 @@ def rigid_impacts() -> Impact:
     return resolve_impact(rod, [SLIDE, -APPROACH], ROD_FRICTION, 0.0)
 
 
-class RodImpact(Staged):
+class RodImpact(Workload):
     """The falling rod as a workload.
 
     Args:
@@ -473,7 +473,7 @@ def exact_taps(
     return place, force(times, place, speed)
 
 
-class Tap(Staged):
+class Tap(Workload):
     """Tapping on a wall as a workload.
 
     Args:
@@ -513,17 +513,3 @@ class Tap(Staged):
             handle=motion_along(tapping, duration, self._finest),
         )
         return PeerWork((task,), duration, self._judge)
-
-    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
-        (take,) = takes
-        if take.has_diverged:
-            return {TAP_PANEL.key: diverged(take.created, take.ended)}
-        records = take.records_at(self._grid)
-        has_touched = bool(np.any(records["contacts"] > 0))
-        score = score_of(
-            self._reference,
-            records,
-            created=take.created,
-            verdict=take.environment if has_touched else "lost contact",
-        )
-        return {TAP_PANEL.key: score}

@@ -16,8 +16,8 @@ from hapticbridge.kernel.ledger import ENERGY_TOLERANCE
 from hapticbridge.kernel.pose import conjugate, dot, rotated, rotation_between, subtract
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.scene_run import Path
+from hapticbridge.lab.chart.score import Judge, PeerWork, Reading, Score, Take, Verdict
 from hapticbridge.lab.chart.setting import Setting
-from hapticbridge.lab.chart.workload import Judge, PeerWork, Reading, Score, Take, Verdict
 from hapticbridge.lab.engines.base import (
     Engine,
     Pose,

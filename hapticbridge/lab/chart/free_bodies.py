@@ -18,8 +18,8 @@ from hapticbridge.demand.pulse import FORCE_FLOOR
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import work_of
-from hapticbridge.lab.chart.scene_run import Prepared, Staged, Stages
-from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
+from hapticbridge.lab.chart.scene_run import Prepared, Stages, Workload
+from hapticbridge.lab.chart.score import Panel, PeerWork, Score, Take, diverged, score_of
 from hapticbridge.lab.engines.base import Velocity
 from hapticbridge.lab.maps.base import free_body, scene_of
 from hapticbridge.scene import Scene, load_scene
@@ -109,7 +109,7 @@ def exact_records(coupling: Coupling, grid: float) -> NDArray[np.void]:
     return records
 
 
-class DrivenMass(Staged):
+class DrivenMass(Workload):
     """The driven point mass as a workload.
 
     Args:
@@ -139,17 +139,6 @@ class DrivenMass(Staged):
         """Describes the mass to other engines."""
         scene = load_scene("point_mass")
         return work_of(scene, handle_path, self._duration, self._finest, self.coupling, self._judge)
-
-    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
-        (take,) = takes
-        if take.has_diverged:
-            return {DRIVEN_PANEL.key: diverged(take.created, take.ended)}
-        records = take.records_at(self._grid)
-        return {
-            DRIVEN_PANEL.key: score_of(
-                self._reference, records, created=take.created, verdict=take.environment
-            )
-        }
 
 
 SPINNING_MASS = 0.3
@@ -212,7 +201,7 @@ def exact_orientations(grid: float, count: int) -> NDArray[np.float64]:
     return np.where(orientation[:, :1] < 0, -orientation, orientation)
 
 
-class SpinningBody(Staged):
+class SpinningBody(Workload):
     """The tumbling body as a workload.
 
     Args:
@@ -346,7 +335,7 @@ def exact_arm(coupling: Coupling, grid: float, count: int) -> NDArray[np.void]:
     return records
 
 
-class SpringArm(Staged):
+class SpringArm(Workload):
     """The arm as a workload.
 
     Args:
@@ -375,15 +364,3 @@ class SpringArm(Staged):
             StudyError: Always.
         """
         raise StudyError("the arm has a hinge, and other engines are given free bodies alone")
-
-    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
-        (take,) = takes
-        if take.has_diverged:
-            return {ARM_PANEL.key: diverged(take.created, take.ended)}
-        score = score_of(
-            self._reference,
-            take.records_at(self._grid),
-            created=take.created,
-            verdict=take.environment,
-        )
-        return {ARM_PANEL.key: score}

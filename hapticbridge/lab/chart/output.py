@@ -22,8 +22,8 @@ from matplotlib.ticker import NullFormatter
 from hapticbridge.errors import StudyError
 from hapticbridge.files import finite_or_null, prepared_folder, reason_of
 from hapticbridge.lab.chart.chart import Chart, Measurement, Order
+from hapticbridge.lab.chart.score import PASSIVE, Panel, Verdict
 from hapticbridge.lab.chart.setting import OWN, Setting, simulator_name
-from hapticbridge.lab.chart.workload import PASSIVE, Panel, Verdict
 from hapticbridge.plotting import new_figure, write_picture
 from hapticbridge.run.description import versions
 from hapticbridge.run.options import DEFAULT_OPTIONS

@@ -23,12 +23,11 @@ from hapticbridge.lab.chart.scene_run import (
     REFERENCE_REFINEMENT,
     OwnReferences,
     Prepared,
-    Staged,
     Stages,
+    Workload,
     path_of,
 )
-from hapticbridge.lab.chart.setting import OWN, Setting
-from hapticbridge.lab.chart.workload import (
+from hapticbridge.lab.chart.score import (
     Judge,
     Panel,
     PeerWork,
@@ -37,6 +36,7 @@ from hapticbridge.lab.chart.workload import (
     diverged,
     score_of,
 )
+from hapticbridge.lab.chart.setting import OWN, Setting
 from hapticbridge.lab.engines.base import open_engine
 from hapticbridge.lab.maps.contact_rigs import ROTATION
 from hapticbridge.scene import Scene, load_scene, scene_path
@@ -259,7 +259,7 @@ def _scene() -> Scene:
     return load_scene("peg_in_hole", friction=0.0)
 
 
-class PegInHole(Staged):
+class PegInHole(Workload):
     """The peg in its hole as a workload.
 
     Args:
@@ -432,7 +432,7 @@ JAM_PANEL = Panel(
 )
 
 
-class Jam(Staged):
+class Jam(Workload):
     """The jammed peg as a workload.
 
     A jam with friction has no motion that is true for every mechanics, but no rigid peg is inside a

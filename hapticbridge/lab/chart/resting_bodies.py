@@ -14,8 +14,8 @@ from hapticbridge.kernel.pose import quaternion_exp
 from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.lab.chart.engine_run import work_of
 from hapticbridge.lab.chart.peg import RAMP, STAY, led, score_at_rest
-from hapticbridge.lab.chart.scene_run import Prepared, Staged, Stages
-from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
+from hapticbridge.lab.chart.scene_run import Prepared, Stages, Workload
+from hapticbridge.lab.chart.score import Panel, PeerWork, Score, Take
 from hapticbridge.lab.maps.base import scene_of
 from hapticbridge.run.options import Workspace
 from hapticbridge.scene import Scene
@@ -142,7 +142,7 @@ def leaning_force(coupling: Coupling, times: NDArray[np.float64]) -> NDArray[np.
     return force
 
 
-class Stack(Staged):
+class Stack(Workload):
     """The stack as a workload.
 
     Args:
@@ -182,20 +182,6 @@ class Stack(Staged):
         """Describes the stack to other engines."""
         duration = self._grid * self._reference.size
         return work_of(stack_scene(), leaned, duration, self._finest, self.coupling, self._judge)
-
-    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
-        (take,) = takes
-        if take.has_diverged:
-            return {STACK_PANEL.key: diverged(take.created, take.ended)}
-        records = take.records_at(self._grid)
-        is_touching = bool(np.any(records["contacts"] > 0))
-        score = score_of(
-            self._reference,
-            records,
-            created=take.created,
-            verdict=take.environment if is_touching else "lost contact",
-        )
-        return {STACK_PANEL.key: score}
 
 
 # The key
@@ -316,7 +302,7 @@ def turning(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
     return led(_KEY_PATH, times)
 
 
-class HexSocket(Staged):
+class HexSocket(Workload):
     """The key in its socket as a workload.
 
     Args:

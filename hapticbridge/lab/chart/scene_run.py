@@ -30,25 +30,24 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
+from hapticbridge.lab.chart.score import (
+    NAN,
+    Judge,
+    Panel,
+    PeerWork,
+    Reading,
+    Run,
+    Score,
+    Take,
+    diverged,
+    score_of,
+)
 from hapticbridge.lab.chart.setting import (
     OWN,
     SCENE_TICKS,
     USUAL_MS,
     Setting,
     ShippedOptions,
-)
-from hapticbridge.lab.chart.workload import (
-    NAN,
-    Judge,
-    Panel,
-    PeerWork,
-    Reading,
-    References,
-    Run,
-    Score,
-    Take,
-    diverged,
-    score_of,
 )
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.run.options import (
@@ -393,23 +392,34 @@ def fine_records(
     return kept
 
 
-class Staged(ABC):
-    """A workload whose points are one stage at different settings.
+class Workload(ABC):
+    """A workload of a chart: one stage at different settings.
 
     Args:
-        coupling: K and B.
+        coupling: Requested K and B.
         stages: Stages to run on.
-        references: The methods' own limits, if the workload compares with them.
+        references: The methods' own limits, if a panel compares with them.
 
     Attributes:
+        name: Name at the command line.
+        about: One sentence.
+        panels: At least one; the recommendation depends on the first.
+        has_contact: True if bodies can touch.
         needs_tool: Text after "method 'weld' …" for a method without the tool's own dynamics; empty
             if the workload suits it.
     """
 
+    name: str
+    about: str
+    panels: Sequence[Panel]
+    has_contact: bool
     needs_tool: ClassVar[str] = ""
+    # of a workload that is judged by one reference: its rows, and the time between them in s
+    _reference: NDArray[np.void]
+    _grid: float
 
     def __init__(
-        self, coupling: Coupling, stages: Stages, references: References | None = None
+        self, coupling: Coupling, stages: Stages, references: OwnReferences | None = None
     ) -> None:
         self.coupling = coupling
         self.references = references
@@ -427,8 +437,30 @@ class Staged(ABC):
         return SceneRun(self._stages.for_method(setting), setting, self._judge)
 
     @abstractmethod
+    def peer_work(self) -> PeerWork:
+        """Returns the workload for other engines.
+
+        Raises:
+            StudyError: Other engines cannot represent it.
+        """
+
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
-        """Returns the scores of a point's takes by ``Panel.key``."""
+        """Returns the scores of a point's takes by ``Panel.key``: one take against the reference.
+
+        The tool of a workload with contact must touch, or it is not the workload's motion.
+        """
+        (take,), (panel,) = takes, self.panels
+        if take.has_diverged:
+            return {panel.key: diverged(take.created, take.ended)}
+        records = take.records_at(self._grid)
+        is_lost = self.has_contact and not np.any(records["contacts"] > 0)
+        score = score_of(
+            self._reference,
+            records,
+            created=take.created,
+            verdict="lost contact" if is_lost else take.environment,
+        )
+        return {panel.key: score}
 
 
 COUPLING = Coupling(1000.0, 1.0, 1.0, 1e-3)
@@ -450,7 +482,7 @@ REFINEMENT = 8
 default. Scenes cost many times as much as a peg."""
 
 
-class SceneMotion(Staged):
+class SceneMotion(Workload):
     """A shipped or user's scene with its hand path as a workload.
 
     Args:

@@ -6,29 +6,34 @@ import ctypes
 import os
 import sys
 import tempfile
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
-from typing import BinaryIO, Literal, NamedTuple, Protocol, get_args
+from typing import BinaryIO, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion, pose_at
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.files import install_command
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.pose import (
+    ZERO_VECTOR,
     Quaternion,
     Vector,
     add,
     canonical,
     conjugate,
+    cross,
     product,
     rotated,
+    rotation_between,
     scaled,
+    subtract,
 )
 
 _STDOUT = 1
@@ -82,15 +87,6 @@ Kind = Literal["box", "sphere", "capsule", "mesh"]
 SIZES = {"box": 3, "sphere": 1, "capsule": 2, "mesh": 0}
 """Count of numbers in a shape's size, by kind."""
 
-NORM_TOLERANCE = 1e-9
-"""Largest deviation of a quaternion's norm from 1. It admits rounding and refuses a wrong
-scaling."""
-
-MAX_STEPS = 10**8
-"""Largest number of steps in a run: a day at 1 kHz."""
-
-_ARGUMENTS = Arguments(StudyError)
-
 
 class Pose(NamedTuple):
     """A position in m and an orientation, a unit quaternion (w, x, y, z)."""
@@ -110,22 +106,6 @@ ORIGIN = Pose()
 AT_REST = Velocity()
 
 
-def check_pose(name: str, pose: Pose) -> None:
-    """Refuses a pose that is not finite or whose quaternion is not of norm 1 within 1e-9.
-
-    Raises:
-        StudyError: The pose is not finite or not of unit norm.
-    """
-    _vector(f"{name} position", pose.position, "m")
-    quaternion = _ARGUMENTS.numbers(f"{name} quaternion", pose.quaternion)
-    norm = float(np.linalg.norm(quaternion))
-    if quaternion.shape != (4,) or not abs(norm - 1.0) <= NORM_TOLERANCE:
-        raise StudyError(
-            f"{name} quaternion is {pose.quaternion}; it must be four numbers of norm 1 "
-            f"within {NORM_TOLERANCE:g}"
-        )
-
-
 def composed(outer: Pose, inner: Pose) -> Pose:
     """Returns in the world frame the pose ``inner``, which is given in the frame ``outer``."""
     position = add(outer.position, rotated(outer.quaternion, inner.position))
@@ -136,11 +116,6 @@ def inverted(pose: Pose) -> Pose:
     """Returns the pose of the world in the frame ``pose``."""
     back = conjugate(pose.quaternion)
     return Pose(rotated(back, scaled(-1.0, pose.position)), canonical(back))
-
-
-def _vector(name: str, value: Vector, unit: str) -> None:
-    if _ARGUMENTS.numbers(name, value, unit).shape != (3,):
-        raise StudyError(f"{name} is {value}; it must be three numbers in {unit}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,9 +130,6 @@ class Shape:
         quaternion: Orientation of its axes.
         vertices: Vertices of a mesh in its own frame, in m, shape (n, 3), n >= 4. The shape is
             their convex hull.
-
-    Raises:
-        StudyError: A value is not finite, out of range or mis-shaped.
     """
 
     kind: Kind
@@ -165,25 +137,6 @@ class Shape:
     position: Vector = (0.0, 0.0, 0.0)
     quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
     vertices: NDArray[np.float64] | None = None
-
-    def __post_init__(self) -> None:
-        if self.kind not in get_args(Kind):
-            raise StudyError(f"shape kind is {self.kind!r}; kinds: {choices(get_args(Kind))}")
-        if len(self.size) != SIZES[self.kind]:
-            raise StudyError(
-                f"size of a {self.kind} has {len(self.size)} numbers; it has {SIZES[self.kind]}"
-            )
-        if self.size:
-            _ARGUMENTS.numbers(f"{self.kind} size", self.size, "m", least=0, is_open=True)
-        check_pose("shape", self.pose)
-        if (self.vertices is None) == (self.kind == "mesh"):
-            raise StudyError("a mesh has vertices, and no other shape has")
-        if self.vertices is not None:
-            points = _ARGUMENTS.numbers("mesh vertices", self.vertices, "m")
-            if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
-                raise StudyError(
-                    f"mesh vertices have shape {points.shape}; they must be (n, 3) with n >= 4"
-                )
 
     @property
     def pose(self) -> Pose:
@@ -201,9 +154,6 @@ class Body:
         inertia_frame: Centre of mass and principal axes in the body's frame.
         shapes: Shapes in the body's frame; may be empty.
         friction: Coulomb's coefficient of every contact, without unit, >= 0.
-
-    Raises:
-        StudyError: A value is not finite or out of range.
     """
 
     mass: float
@@ -211,18 +161,6 @@ class Body:
     inertia_frame: Pose = ORIGIN
     shapes: tuple[Shape, ...] = ()
     friction: float = 0.0
-
-    def __post_init__(self) -> None:
-        _ARGUMENTS.number("mass", self.mass, "kg", least=0, is_open=True)
-        moments = _ARGUMENTS.numbers("inertia", self.inertia, "kg m²", least=0, is_open=True)
-        # 1e-9 for moments of a flat body, whose largest equals the sum by rounding
-        if moments.shape != (3,) or 2 * moments.max() > moments.sum() * (1 + 1e-9):
-            raise StudyError(
-                f"inertia is {self.inertia}; it must be three moments in kg m², "
-                "none larger than the sum of the other two"
-            )
-        check_pose("inertia frame", self.inertia_frame)
-        _ARGUMENTS.number("friction", self.friction, least=0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,16 +170,10 @@ class FreeBody:
     Attributes:
         body: Mass, inertia and shapes.
         start: Pose of the body's frame at the start.
-
-    Raises:
-        StudyError: The pose is not finite or not of unit norm.
     """
 
     body: Body
     start: Pose = ORIGIN
-
-    def __post_init__(self) -> None:
-        check_pose("start", self.start)
 
     @property
     def principal(self) -> Pose:
@@ -271,9 +203,6 @@ class Task:
         handle: Poses of the handle in the world frame over time. None keeps it at the grip's pose
             at the start.
         others: Other free bodies, at rest at the start, with the friction of the tool.
-
-    Raises:
-        StudyError: A value is not finite or mis-shaped, or the friction differs.
     """
 
     name: str
@@ -287,15 +216,6 @@ class Task:
     handle: Motion | None = None
     others: tuple[FreeBody, ...] = ()
 
-    def __post_init__(self) -> None:
-        _vector("gravity", self.gravity, "m/s²")
-        if any(other.body.friction != self.body.friction for other in self.others):
-            raise StudyError("the bodies of a task differ in friction, and a task has one")
-        check_pose("grip", self.grip)
-        check_pose("start", self.start)
-        _vector("start velocity", self.start_velocity.linear, "m/s")
-        _vector("start angular velocity", self.start_velocity.angular, "rad/s")
-
     @property
     def bodies(self) -> tuple[FreeBody, ...]:
         """Free bodies at their start, the tool first."""
@@ -307,12 +227,7 @@ class Task:
         Args:
             timestep: T in s.
             steps: N.
-
-        Raises:
-            StudyError: The timestep is not finite and positive, or N < 1.
         """
-        check_timestep(timestep)
-        _ARGUMENTS.whole("steps", steps, least=1, most=MAX_STEPS)
         if self.handle is None:
             return [composed(self.start, self.grip)] * (steps + 1)
         found, cursor = [], 0
@@ -320,15 +235,6 @@ class Task:
             cursor, position, quaternion = pose_at(self.handle.table, k * timestep, cursor)
             found.append(Pose(position, quaternion))
         return found
-
-
-def check_timestep(timestep: float) -> float:
-    """Returns a timestep in s, one finite number > 0.
-
-    Raises:
-        StudyError: It is not finite or not > 0.
-    """
-    return _ARGUMENTS.number("timestep", timestep, "s", least=0, is_open=True)
 
 
 class Wrench(NamedTuple):
@@ -363,29 +269,71 @@ class Advised(NamedTuple):
     source: str
 
 
-class Simulation(Protocol):
-    """A task in an engine, at some step. Step 0 is the start.
+Frame = tuple[Vector, Quaternion]
+"""Position in m and orientation, as the compiler stores them."""
 
-    Body 0 is the tool; the others follow in the task's order.
+_AT_ORIGIN = (ZERO_VECTOR, (1.0, 0.0, 0.0, 0.0))
+
+
+class Simulation(ABC):
+    """A task in an engine, at some step, with a coupling that the engine holds for a step.
+
+    Step 0 is the start. Body 0 is the tool; the others follow in the task's order. The coupling is
+    a force and a torque, applied to the engine every step:
+
+        f_k = K e_k + (B/T)(e_k − e_{k−1}),    e = h − x
+        τ_k = K_r φ_k + (B_r/T)(δφ_h − δφ_x),  φ = log(R_h R_xᵀ)
+
+    with the handle h and the grip x at the end of step k; step k + 1 runs under (f_k, τ_k), moved
+    to the centre of mass. This is ``theory.drive_mass``'s scheme ``held``. The handle has not moved
+    before step 0.
+
+    Engines describe a body by its centre of mass. A child's body is therefore the frame of the
+    principal axes of inertia; ``FreeBody`` converts to it. A child opens its engine in
+    ``__init__`` after that of this class, and calls ``_begin`` last.
     """
 
+    def __init__(self, task: Task, timestep: float) -> None:
+        self._timestep = timestep
+        coupling = task.coupling
+        self._gains = (
+            None
+            if coupling is None
+            else (
+                coupling.stiffness,
+                coupling.damping / timestep,
+                coupling.rotational_stiffness,
+                coupling.rotational_damping / timestep,
+            )
+        )
+        self._grip = (task.grip.position, task.grip.quaternion)
+        self._frames = [free.body.inertia_frame for free in task.bodies]
+        self._body_in_principal = [inverted(frame) for frame in self._frames]
+        self._centre = task.body.inertia_frame.position
+        self._handle: Frame = _AT_ORIGIN
+        self._tool: Frame = _AT_ORIGIN
+        self._wrench = self._at_centre = self._held = (ZERO_VECTOR, ZERO_VECTOR)
+
+    def _begin(self, task: Task) -> None:
+        """Computes the wrench of step 0."""
+        handle = task.handle_poses(self._timestep, 1)[0]
+        self._handle = (handle.position, handle.quaternion)
+        grip = composed(self.pose(), task.grip)
+        self._tool = (grip.position, grip.quaternion)
+        self._measure(self._handle)
+
     def step(self, handle_position: Vector, handle_quaternion: Quaternion) -> None:
-        """Advances from step k − 1 to step k, at whose end the handle is at h_k.
+        """Advances to step k, at whose end the handle is at h_k, under f_{k−1}; computes f_k."""
+        self._couple((handle_position, handle_quaternion))
+        self._measure((handle_position, handle_quaternion))
 
-        A held coupling acts on the tool during the step with f_{k−1}; f_k is computed at its end.
-        """
-
-    def advance(self, force: Vector, torque: Vector) -> None:
-        """Sets a force in N and a torque in N m at the centre of mass and steps; this is timed."""
-
-    def pose(self, body: int = 0) -> Pose:
-        """Returns the pose of a body's frame."""
-
-    def velocity(self, body: int = 0) -> Velocity:
-        """Returns the velocity of a body's centre of mass and its angular velocity."""
+    def _couple(self, _handle: Frame) -> None:
+        """Advances the engine; a child whose engine has its own spring aims it at the handle."""
+        self.advance(*self._at_centre)
 
     def wrench(self) -> Wrench:
         """Returns the coupling's wrench f_k on the tool, about the grip."""
+        return Wrench(*self._wrench)
 
     def applied(self) -> Wrench:
         """Returns the coupling's wrench on the tool during the last step, about the grip.
@@ -393,35 +341,92 @@ class Simulation(Protocol):
         A held coupling applies f_{k−1}, a spring of the engine's own f_k. It is nan where the
         engine does not tell its spring's force.
         """
+        return Wrench(*self._held)
 
+    def _measure(self, handle: Frame) -> None:
+        if self._gains is None:
+            return
+        self._held = self._wrench
+        pose = self.pose()
+        self._tool, self._wrench, self._at_centre = _law(
+            self._gains,
+            (pose.position, pose.quaternion),
+            self._grip,
+            self._centre,
+            self._handle,
+            handle,
+            self._tool,
+        )
+        self._handle = handle
+
+    @abstractmethod
+    def advance(self, force: Vector, torque: Vector) -> None:
+        """Sets a force in N and a torque in N m at the centre of mass and steps; this is timed."""
+
+    @abstractmethod
+    def principal_pose(self, body: int = 0) -> Pose:
+        """Returns the pose of the principal axes of inertia at a body's centre of mass."""
+
+    def pose(self, body: int = 0) -> Pose:
+        """Returns the pose of a body's frame."""
+        return composed(self.principal_pose(body), self._body_in_principal[body])
+
+    @abstractmethod
+    def velocity(self, body: int = 0) -> Velocity:
+        """Returns the velocity of a body's centre of mass and its angular velocity."""
+
+    @abstractmethod
     def contacts(self) -> Contacts:
         """Returns the contacts of the last step."""
 
+    @abstractmethod
     def close(self) -> None:
         """Releases the resources of the engine. Closing twice is allowed."""
 
 
-class Engine(Protocol):
-    """A physics engine, tuned as its own documentation advises."""
+@compiled
+def _law(
+    gains: tuple[float, float, float, float],
+    body: Frame,
+    grip: Frame,
+    centre: Vector,
+    handle_before: Frame,
+    handle: Frame,
+    tool_before: Frame,
+) -> tuple[Frame, tuple[Vector, Vector], tuple[Vector, Vector]]:
+    """Returns the grip's pose, the wrench about it, and the same wrench at the centre of mass."""
+    stiffness, damping, rotational_stiffness, rotational_damping = gains
+    position = add(body[0], rotated(body[1], grip[0]))
+    orientation = product(body[1], grip[1])
+    stretched = subtract(subtract(handle[0], handle_before[0]), subtract(position, tool_before[0]))
+    twisted = subtract(
+        rotation_between(handle_before[1], handle[1]), rotation_between(tool_before[1], orientation)
+    )
+    force = add(scaled(stiffness, subtract(handle[0], position)), scaled(damping, stretched))
+    torque = add(
+        scaled(rotational_stiffness, rotation_between(orientation, handle[1])),
+        scaled(rotational_damping, twisted),
+    )
+    lever = subtract(position, add(body[0], rotated(body[1], centre)))
+    return (position, orientation), (force, torque), (force, add(torque, cross(lever, force)))
 
-    @property
-    def name(self) -> str:
-        """Name for ``--engines``."""
 
-    @property
-    def version(self) -> str:
-        """Version of the installed library."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Engine:
+    """A physics engine, tuned as its own documentation advises.
 
-    @property
-    def settings(self) -> Mapping[str, Advised]:
-        """Settings with the pages of the documentation that advise them."""
+    Attributes:
+        name: Name for ``--engines``.
+        version: Version of the installed library.
+        settings: Settings with the pages of the documentation that advise them.
+        open: Opens a task with steps of a length in s; raises StudyError where the engine cannot
+            describe the task.
+    """
 
-    def open(self, task: Task, timestep: float) -> Simulation:
-        """Opens a task with steps of ``timestep`` in s.
-
-        Raises:
-            StudyError: The engine cannot describe the task, or the timestep is out of range.
-        """
+    name: str
+    version: str
+    settings: Mapping[str, Advised]
+    open: Callable[[Task, float], Simulation]
 
 
 _PACKAGE = "hapticbridge.lab.engines"

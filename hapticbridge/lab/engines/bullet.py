@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -16,7 +17,6 @@ import pybullet
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.pose import Quaternion, Vector
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import HeldSimulation
 
 SLOP = 1e-7
 """Depth in m that a contact keeps under sequential impulses. A settled tool is wrong by Bullet's
@@ -59,28 +59,7 @@ _TYPES = {
 }
 
 
-class PybulletEngine:
-    """Bullet's multibody world with one of its solvers."""
-
-    version = version("pybullet")
-
-    def __init__(self, name: str, parameters: Mapping[str, float], solver: str) -> None:
-        """Takes its name, options of ``setPhysicsEngineParameter`` and the solver's name."""
-        self.name = name
-        self._parameters = dict(parameters)
-        raw = {key: base.Advised(f"{value:g}", _PARAMETERS) for key, value in parameters.items()}
-        self.settings: Mapping[str, base.Advised] = {
-            **_SHARED,
-            **raw,
-            "constraintSolverType": base.Advised(solver, _PARAMETERS),
-        }
-
-    def open(self, task: base.Task, timestep: float) -> PybulletSimulation:
-        """Opens a task; see ``Engine.open``."""
-        return PybulletSimulation(task, timestep, self._parameters)
-
-
-class PybulletSimulation(HeldSimulation):
+class PybulletSimulation(base.Simulation):
     """A task in its own Bullet world."""
 
     def __init__(self, task: base.Task, timestep: float, parameters: Mapping[str, float]) -> None:
@@ -230,7 +209,19 @@ def engines() -> tuple[base.Engine, ...]:
         "globalCFM": CFM,
         "constraintSolverType": pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG,
     }
-    return (
-        PybulletEngine("pybullet", impulses, "sequential impulses (default)"),
-        PybulletEngine("pybullet_dantzig", direct, "Dantzig, direct (marked experimental)"),
+    return tuple(
+        base.Engine(
+            name,
+            version("pybullet"),
+            {
+                **_SHARED,
+                **{key: base.Advised(f"{value:g}", _PARAMETERS) for key, value in chosen.items()},
+                "constraintSolverType": base.Advised(solver, _PARAMETERS),
+            },
+            partial(PybulletSimulation, parameters=chosen),
+        )
+        for name, chosen, solver in (
+            ("pybullet", impulses, "sequential impulses (default)"),
+            ("pybullet_dantzig", direct, "Dantzig, direct (marked experimental)"),
+        )
     )

@@ -6,7 +6,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from functools import partial
 from importlib.metadata import version
 from itertools import count
 from typing import Any
@@ -32,7 +32,6 @@ from pydrake.systems.framework import DiagramBuilder
 
 from hapticbridge.kernel.pose import Vector
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import HeldSimulation
 
 POINT_STIFFNESS = 1e7
 """Stiffness of a point contact in N/m. The remaining error stems from Drake's single point for two
@@ -58,23 +57,7 @@ _SHARED = {
 }
 
 
-class DrakeEngine:
-    """Drake with one of its contact models."""
-
-    version = version("drake")
-
-    def __init__(self, name: str, contact_model: str, settings: Mapping[str, base.Advised]) -> None:
-        """Takes its name, Drake's name of the contact model, and the settings of that model."""
-        self.name = name
-        self._contact_model = contact_model
-        self.settings: Mapping[str, base.Advised] = {**_SHARED, **settings}
-
-    def open(self, task: base.Task, timestep: float) -> DrakeSimulation:
-        """Opens a task; see ``Engine.open``."""
-        return DrakeSimulation(task, timestep, self._contact_model)
-
-
-class DrakeSimulation(HeldSimulation):
+class DrakeSimulation(base.Simulation):
     """A task in Drake.
 
     Drake refuses to continue from a state that is not finite; from then on the pose is nan.
@@ -230,7 +213,12 @@ def engines() -> tuple[base.Engine, ...]:
         ),
         "relaxation_time": base.Advised("1 timestep", f"{_PROPERTIES}: relaxation_time"),
     }
-    return (
-        DrakeEngine("drake_point", "point", point),
-        DrakeEngine("drake_hydroelastic", "hydroelastic", hydroelastic),
+    return tuple(
+        base.Engine(
+            f"drake_{model}",
+            version("drake"),
+            {**_SHARED, **settings},
+            partial(DrakeSimulation, contact_model=model),
+        )
+        for model, settings in (("point", point), ("hydroelastic", hydroelastic))
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from itertools import combinations
 
 import mujoco
@@ -13,18 +12,12 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, held_body
-from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.pose import (
-    ZERO_VECTOR,
-    Quaternion,
-    Vector,
     add,
     canonical,
     cross,
     product,
     rotated,
-    rotation_between,
-    scaled,
     subtract,
 )
 from hapticbridge.lab.engines import base
@@ -243,143 +236,3 @@ def _quaternion(matrix: Array) -> Array:
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, matrix)
     return quaternion
-
-
-Frame = tuple[Vector, Quaternion]
-"""Position in m and orientation, as the compiler stores them."""
-
-_AT_ORIGIN = (ZERO_VECTOR, (1.0, 0.0, 0.0, 0.0))
-
-
-class HeldSimulation(ABC):
-    """A simulation whose coupling is a force and a torque, applied to the engine every step.
-
-        f_k = K e_k + (B/T)(e_k − e_{k−1}),    e = h − x
-        τ_k = K_r φ_k + (B_r/T)(δφ_h − δφ_x),  φ = log(R_h R_xᵀ)
-
-    with the handle h and the grip x at the end of step k; step k + 1 runs under (f_k, τ_k), moved
-    to the centre of mass. This is ``theory.drive_mass``'s scheme ``held``. The handle has not moved
-    before step 0.
-
-    Engines describe a body by its centre of mass. A child's body is therefore the frame of the
-    principal axes of inertia; ``base.FreeBody`` converts to it. A child opens its engine in
-    ``__init__`` after that of this class, and calls ``_begin`` last.
-    """
-
-    def __init__(self, task: base.Task, timestep: float) -> None:
-        """Stores the task and computes the poses of the handle.
-
-        Raises:
-            StudyError: The timestep is not finite and positive.
-        """
-        self._timestep = base.check_timestep(timestep)
-        coupling = task.coupling
-        self._gains = (
-            None
-            if coupling is None
-            else (
-                coupling.stiffness,
-                coupling.damping / timestep,
-                coupling.rotational_stiffness,
-                coupling.rotational_damping / timestep,
-            )
-        )
-        self._grip = (task.grip.position, task.grip.quaternion)
-        self._frames = [free.body.inertia_frame for free in task.bodies]
-        self._body_in_principal = [base.inverted(frame) for frame in self._frames]
-        self._centre = task.body.inertia_frame.position
-        self._handle: Frame = _AT_ORIGIN
-        self._tool: Frame = _AT_ORIGIN
-        self._wrench = self._at_centre = self._held = (ZERO_VECTOR, ZERO_VECTOR)
-
-    def _begin(self, task: base.Task) -> None:
-        """Computes the wrench of step 0."""
-        handle = task.handle_poses(self._timestep, 1)[0]
-        self._handle = (handle.position, handle.quaternion)
-        grip = base.composed(self.pose(), task.grip)
-        self._tool = (grip.position, grip.quaternion)
-        self._measure(self._handle)
-
-    def step(self, handle_position: Vector, handle_quaternion: Quaternion) -> None:
-        """Advances one step under the wrench of the last step, and computes the next wrench."""
-        self._couple((handle_position, handle_quaternion))
-        self._measure((handle_position, handle_quaternion))
-
-    def _couple(self, _handle: Frame) -> None:
-        """Advances the engine; a child whose engine has its own spring aims it at the handle."""
-        self.advance(*self._at_centre)
-
-    def wrench(self) -> base.Wrench:
-        """Returns the wrench on the tool about the grip."""
-        return base.Wrench(*self._wrench)
-
-    def applied(self) -> base.Wrench:
-        """Returns the wrench that was held in the last step."""
-        return base.Wrench(*self._held)
-
-    def _measure(self, handle: Frame) -> None:
-        if self._gains is None:
-            return
-        self._held = self._wrench
-        pose = self.pose()
-        self._tool, self._wrench, self._at_centre = _law(
-            self._gains,
-            (pose.position, pose.quaternion),
-            self._grip,
-            self._centre,
-            self._handle,
-            handle,
-            self._tool,
-        )
-        self._handle = handle
-
-    @abstractmethod
-    def advance(self, force: Vector, torque: Vector) -> None:
-        """Sets a force in N and a torque in N m at the centre of mass, and steps."""
-
-    @abstractmethod
-    def principal_pose(self, body: int = 0) -> base.Pose:
-        """Returns the pose of the principal axes of inertia at a body's centre of mass."""
-
-    def pose(self, body: int = 0) -> base.Pose:
-        """Returns the pose of a body's frame."""
-        return base.composed(self.principal_pose(body), self._body_in_principal[body])
-
-    @abstractmethod
-    def velocity(self, body: int = 0) -> base.Velocity:
-        """Returns the velocity of a body's centre of mass and its angular velocity."""
-
-    @abstractmethod
-    def contacts(self) -> base.Contacts:
-        """Returns the contacts of the last step."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Releases the resources of the engine."""
-
-
-@compiled
-def _law(
-    gains: tuple[float, float, float, float],
-    body: Frame,
-    grip: Frame,
-    centre: Vector,
-    handle_before: Frame,
-    handle: Frame,
-    tool_before: Frame,
-) -> tuple[Frame, tuple[Vector, Vector], tuple[Vector, Vector]]:
-    """Returns the grip's pose, the wrench about it, and the same wrench at the centre of mass."""
-    stiffness, damping, rotational_stiffness, rotational_damping = gains
-    position = add(body[0], rotated(body[1], grip[0]))
-    orientation = product(body[1], grip[1])
-    stretched = subtract(subtract(handle[0], handle_before[0]), subtract(position, tool_before[0]))
-    twisted = subtract(
-        rotation_between(handle_before[1], handle[1]), rotation_between(tool_before[1], orientation)
-    )
-    force = add(scaled(stiffness, subtract(handle[0], position)), scaled(damping, stretched))
-    torque = add(
-        scaled(rotational_stiffness, rotation_between(orientation, handle[1])),
-        scaled(rotational_damping, twisted),
-    )
-    lever = subtract(position, add(body[0], rotated(body[1], centre)))
-    return (position, orientation), (force, torque), (force, add(torque, cross(lever, force)))

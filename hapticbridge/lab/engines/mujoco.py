@@ -12,7 +12,6 @@ import mujoco
 
 from hapticbridge.kernel.pose import Vector, add, conjugate, cross, rotated, subtract
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import HeldSimulation
 
 _MODELING = "MuJoCo documentation, Modeling: Solver parameters"
 _OVERVIEW = "MuJoCo documentation, Computation: Numerical integration"
@@ -39,29 +38,21 @@ TOOL = 1
 """Number of the tool in MuJoCo, whose body 0 is the world."""
 
 
-class MujocoEngine:
-    """MuJoCo with ``implicitfast``, its elliptic cone and contacts as stiff as it advises."""
-
-    name = "mujoco"
-    version = mujoco.__version__
-    settings: Mapping[str, base.Advised] = {
-        "coupling": base.Advised(
-            "held force, xfrc_applied", "MuJoCo documentation, Computation: State"
-        ),
-        "integrator": base.Advised("implicitfast", _OVERVIEW),
-        "cone": base.Advised("elliptic", _REFERENCE),
-        "solver": base.Advised("Newton, tolerance 1e-10", _REFERENCE),
-        "diagexact": base.Advised("enable", _REFERENCE),
-        "solref": base.Advised("2 timesteps, damping ratio 1", _MODELING),
-        "solimp": base.Advised("0.95 0.99 0.001 0.5 2", _MODELING),
-    }
-
-    def open(self, task: base.Task, timestep: float) -> MujocoSimulation:
-        """Opens a task; see ``Engine.open``."""
-        return MujocoSimulation(task, timestep)
+SETTINGS: Mapping[str, base.Advised] = {
+    "coupling": base.Advised(
+        "held force, xfrc_applied", "MuJoCo documentation, Computation: State"
+    ),
+    "integrator": base.Advised("implicitfast", _OVERVIEW),
+    "cone": base.Advised("elliptic", _REFERENCE),
+    "solver": base.Advised("Newton, tolerance 1e-10", _REFERENCE),
+    "diagexact": base.Advised("enable", _REFERENCE),
+    "solref": base.Advised("2 timesteps, damping ratio 1", _MODELING),
+    "solimp": base.Advised("0.95 0.99 0.001 0.5 2", _MODELING),
+}
+"""Settings: ``implicitfast``, the elliptic cone, and contacts as stiff as MuJoCo advises."""
 
 
-class MujocoSimulation(HeldSimulation):
+class MujocoSimulation(base.Simulation):
     """A task in MuJoCo."""
 
     def __init__(self, task: base.Task, timestep: float) -> None:
@@ -150,4 +141,4 @@ class MujocoSimulation(HeldSimulation):
 
 def engines() -> tuple[base.Engine, ...]:
     """Returns the engines of this module."""
-    return (MujocoEngine(),)
+    return (base.Engine("mujoco", mujoco.__version__, SETTINGS, MujocoSimulation),)

@@ -20,27 +20,18 @@ from numpy.typing import NDArray
 
 from hapticbridge.kernel.pose import Vector
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.mujoco import TOOL, MujocoEngine, MujocoSimulation
+from hapticbridge.lab.engines.mujoco import SETTINGS, TOOL, MujocoSimulation
 
 MAX_CONTACTS, MAX_ROWS = 200, 1000
 """Contacts and rows of constraints that a scene may have; the library drops those beyond."""
 
 
-class MujocoWarpEngine:
-    """MuJoCo Warp with the settings of the engine ``mujoco``, which are MuJoCo's advice."""
-
-    name = "mujoco_warp"
-    version = version("mujoco-warp")
-    settings: Mapping[str, base.Advised] = {
-        **MujocoEngine.settings,
-        "diagexact": base.Advised("not supported", "MuJoCo documentation, MuJoCo Warp"),
-        "device": base.Advised("cpu", "MuJoCo documentation, MuJoCo Warp"),
-        "precision": base.Advised("single (the only one)", "MuJoCo documentation, MuJoCo Warp"),
-    }
-
-    def open(self, task: base.Task, timestep: float) -> MujocoWarpSimulation:
-        """Opens a task; see ``Engine.open``."""
-        return MujocoWarpSimulation(task, timestep)
+_SETTINGS: Mapping[str, base.Advised] = {
+    **SETTINGS,
+    "diagexact": base.Advised("not supported", "MuJoCo documentation, MuJoCo Warp"),
+    "device": base.Advised("cpu", "MuJoCo documentation, MuJoCo Warp"),
+    "precision": base.Advised("single (the only one)", "MuJoCo documentation, MuJoCo Warp"),
+}
 
 
 class MujocoWarpSimulation(MujocoSimulation):
@@ -75,4 +66,5 @@ class MujocoWarpSimulation(MujocoSimulation):
 
 def engines() -> tuple[base.Engine, ...]:
     """Returns the engines of this module."""
-    return (MujocoWarpEngine(),)
+    warp_version = version("mujoco-warp")
+    return (base.Engine("mujoco_warp", warp_version, _SETTINGS, MujocoWarpSimulation),)

@@ -9,7 +9,8 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -20,7 +21,6 @@ from scipy.spatial import ConvexHull
 
 from hapticbridge.kernel.pose import Vector
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import HeldSimulation
 
 GAP = 1e-3
 """Distance in m at which contacts are made. It covers the motion of some steps and is small against
@@ -44,23 +44,7 @@ Solver = Callable[[Any], Any]
 """Function that makes a solver for a model."""
 
 
-class NewtonEngine:
-    """Newton with one of its solvers."""
-
-    version = version("newton")
-
-    def __init__(self, name: str, solver: Solver, settings: Mapping[str, base.Advised]) -> None:
-        """Takes its name, the function that makes the solver, and the settings of the solver."""
-        self.name = name
-        self._solver = solver
-        self.settings: Mapping[str, base.Advised] = {**_SHARED, **settings}
-
-    def open(self, task: base.Task, timestep: float) -> NewtonSimulation:
-        """Opens a task; see ``Engine.open``."""
-        return NewtonSimulation(task, timestep, self._solver)
-
-
-class NewtonSimulation(HeldSimulation):
+class NewtonSimulation(base.Simulation):
     """A task in Newton."""
 
     def __init__(self, task: base.Task, timestep: float, solver: Solver) -> None:
@@ -168,7 +152,15 @@ def engines() -> tuple[base.Engine, ...]:
         "iterations": base.Advised(f"{STEEL_ITERATIONS} (default 12)", _GUIDE),
         "angular damping": base.Advised("0 (default 0.05)", _GUIDE),
     }
-    return (
-        NewtonEngine("newton_xpbd", positions, xpbd),
-        NewtonEngine("newton_steel", impulses, steel),
+    return tuple(
+        base.Engine(
+            name,
+            version("newton"),
+            {**_SHARED, **settings},
+            partial(NewtonSimulation, solver=solver),
+        )
+        for name, solver, settings in (
+            ("newton_xpbd", positions, xpbd),
+            ("newton_steel", impulses, steel),
+        )
     )

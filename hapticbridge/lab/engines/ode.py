@@ -32,7 +32,6 @@ from hapticbridge.kernel.pose import (
     subtract,
 )
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import Frame, HeldSimulation
 
 _NAMES = ("libode.so.8", "libode.so.6", "libode.so", "libode.dylib")
 
@@ -238,34 +237,20 @@ redundant contacts are so near to singular that the solver stops early. At 1e-5 
 _MANUAL = "ODE Manual"
 
 
-class OdeEngine:
-    """ODE with its direct solver."""
-
-    name = "ode"
-    settings: Mapping[str, base.Advised] = {
-        "coupling": base.Advised("held force", f"{_MANUAL}: Rigid Body Functions, Mass and force"),
-        "step": base.Advised("dWorldStep (direct solver)", f"{_MANUAL}: World, Stepping Functions"),
-        "ERP": base.Advised("0.2 (default)", f"{_MANUAL}: Concepts, How To Use ERP and CFM"),
-        "CFM": base.Advised(f"{CFM:g}", f"{_MANUAL}: Concepts, How To Use ERP and CFM"),
-        "contact surface layer": base.Advised(
-            f"{LAYER:g} m", f"{_MANUAL}: World, Contact Parameters"
-        ),
-        "friction": base.Advised("dContactApprox1", f"{_MANUAL}: Joint Types, Contact"),
-        "rotation": base.Advised("finite", f"{_MANUAL}: Rigid Body Functions, Miscellaneous"),
-        "gyroscopic mode": base.Advised("on (default)", f"{_MANUAL}: Rigid Body Functions"),
-    }
-
-    @property
-    def version(self) -> str:
-        """Build configuration of ODE, which does not report its version."""
-        return str(library().dGetConfiguration().decode())
-
-    def open(self, task: base.Task, timestep: float) -> OdeSimulation:
-        """Opens a task; see ``Engine.open``. Convex meshes are not supported."""
-        return OdeSimulation(task, timestep)
+SETTINGS: Mapping[str, base.Advised] = {
+    "coupling": base.Advised("held force", f"{_MANUAL}: Rigid Body Functions, Mass and force"),
+    "step": base.Advised("dWorldStep (direct solver)", f"{_MANUAL}: World, Stepping Functions"),
+    "ERP": base.Advised("0.2 (default)", f"{_MANUAL}: Concepts, How To Use ERP and CFM"),
+    "CFM": base.Advised(f"{CFM:g}", f"{_MANUAL}: Concepts, How To Use ERP and CFM"),
+    "contact surface layer": base.Advised(f"{LAYER:g} m", f"{_MANUAL}: World, Contact Parameters"),
+    "friction": base.Advised("dContactApprox1", f"{_MANUAL}: Joint Types, Contact"),
+    "rotation": base.Advised("finite", f"{_MANUAL}: Rigid Body Functions, Miscellaneous"),
+    "gyroscopic mode": base.Advised("on (default)", f"{_MANUAL}: Rigid Body Functions"),
+}
+"""Settings of ODE with its direct solver."""
 
 
-class OdeSimulation(HeldSimulation):
+class OdeSimulation(base.Simulation):
     """A task in ODE."""
 
     def __init__(self, task: base.Task, timestep: float) -> None:
@@ -392,21 +377,14 @@ _GROUP = 0x100
 """Offset between the parameters of an angular motor's axes."""
 
 
-class OdeSpringEngine(OdeEngine):
-    """ODE with an implicit coupling: a soft ball joint and a soft angular motor."""
-
-    name = "ode_spring"
-    settings: Mapping[str, base.Advised] = {
-        **OdeEngine.settings,
-        "coupling": base.Advised(
-            "implicit spring: ball joint and angular motor, CFM 1/(T K + B)",
-            "ODE Manual: Concepts, How To Use ERP and CFM",
-        ),
-    }
-
-    def open(self, task: base.Task, timestep: float) -> OdeSimulation:
-        """Opens a task; see ``Engine.open``. Convex meshes are not supported."""
-        return OdeSpringSimulation(task, timestep)
+SPRING_SETTINGS: Mapping[str, base.Advised] = {
+    **SETTINGS,
+    "coupling": base.Advised(
+        "implicit spring: ball joint and angular motor, CFM 1/(T K + B)",
+        "ODE Manual: Concepts, How To Use ERP and CFM",
+    ),
+}
+"""Settings with an implicit coupling: a soft ball joint and a soft angular motor."""
 
 
 class OdeSpringSimulation(OdeSimulation):
@@ -453,7 +431,7 @@ class OdeSpringSimulation(OdeSimulation):
         """Returns the wrench of the joints in the last step: the law's at its end."""
         return self.wrench()
 
-    def _couple(self, handle: Frame) -> None:
+    def _couple(self, handle: base.Frame) -> None:
         """Aims the joints at the handle, and steps."""
         if self._gains is not None:
             stiffness, damping, rotational_stiffness, rotational_damping = self._gains
@@ -482,5 +460,9 @@ def engines() -> tuple[base.Engine, ...]:
     Raises:
         StudyError: ODE is not installed.
     """
-    library()
-    return (OdeEngine(), OdeSpringEngine())
+    # ODE does not report its version
+    configuration = str(library().dGetConfiguration().decode())
+    return (
+        base.Engine("ode", configuration, SETTINGS, OdeSimulation),
+        base.Engine("ode_spring", configuration, SPRING_SETTINGS, OdeSpringSimulation),
+    )

@@ -25,7 +25,6 @@ from hapticbridge.kernel.pose import (
     subtract,
 )
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import Frame, HeldSimulation
 
 with warnings.catch_warnings():
     # that no graphics card was found, which nothing here draws on
@@ -62,39 +61,31 @@ _X_TO_Z: Quaternion = (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0)
 """Rotation for capsules, which lie along x in PhysX and along z in a ``Shape``."""
 
 
-class SapienEngine:
-    """PhysX 5 with its temporal Gauss-Seidel solver."""
-
-    name = "physx"
-    version = f"PhysX 5 in SAPIEN {version('sapien')}"
-    settings: Mapping[str, base.Advised] = {
-        "coupling": base.Advised("held force", f"{_DYNAMICS}, Applying Forces"),
-        "solver": base.Advised("TGS", f"{_DYNAMICS}, Temporal Gauss-Seidel"),
-        "position iterations": base.Advised(
-            f"{POSITION_ITERATIONS}", f"{_DYNAMICS}, Solver Iterations"
-        ),
-        "velocity iterations": base.Advised("1", f"{_DYNAMICS}, Solver Iterations"),
-        "contact offset": base.Advised(
-            f"{CONTACT_OFFSET:g} m", f"{_COLLISION}, Tuning Shape Collision"
-        ),
-        "rest offset": base.Advised("0", f"{_COLLISION}, Tuning Shape Collision"),
-        "contact generation": base.Advised("PCM", f"{_COLLISION}, PCM"),
-        "tolerances": base.Advised(
-            f"length {LENGTH:g} m (default 1), speed {SPEED:g} m/s",
-            "PhysX 5 API: PxTolerancesScale, which advises the size of the objects; "
-            "chosen shorter, or PCM keeps normals of a pose that was left",
-        ),
-        "friction": base.Advised("every iteration", f"{_DYNAMICS}, Friction"),
-        "sleep threshold": base.Advised("0", f"{_DYNAMICS}, Sleeping"),
-        "damping": base.Advised("0", f"{_DYNAMICS}, Damping"),
-    }
-
-    def open(self, task: base.Task, timestep: float) -> SapienSimulation:
-        """Opens a task; see ``Engine.open``."""
-        return SapienSimulation(task, timestep)
+SETTINGS: Mapping[str, base.Advised] = {
+    "coupling": base.Advised("held force", f"{_DYNAMICS}, Applying Forces"),
+    "solver": base.Advised("TGS", f"{_DYNAMICS}, Temporal Gauss-Seidel"),
+    "position iterations": base.Advised(
+        f"{POSITION_ITERATIONS}", f"{_DYNAMICS}, Solver Iterations"
+    ),
+    "velocity iterations": base.Advised("1", f"{_DYNAMICS}, Solver Iterations"),
+    "contact offset": base.Advised(
+        f"{CONTACT_OFFSET:g} m", f"{_COLLISION}, Tuning Shape Collision"
+    ),
+    "rest offset": base.Advised("0", f"{_COLLISION}, Tuning Shape Collision"),
+    "contact generation": base.Advised("PCM", f"{_COLLISION}, PCM"),
+    "tolerances": base.Advised(
+        f"length {LENGTH:g} m (default 1), speed {SPEED:g} m/s",
+        "PhysX 5 API: PxTolerancesScale, which advises the size of the objects; "
+        "chosen shorter, or PCM keeps normals of a pose that was left",
+    ),
+    "friction": base.Advised("every iteration", f"{_DYNAMICS}, Friction"),
+    "sleep threshold": base.Advised("0", f"{_DYNAMICS}, Sleeping"),
+    "damping": base.Advised("0", f"{_DYNAMICS}, Damping"),
+}
+"""Settings of PhysX 5 with its temporal Gauss-Seidel solver."""
 
 
-class SapienSimulation(HeldSimulation):
+class SapienSimulation(base.Simulation):
     """A task in its own PhysX scene."""
 
     def __init__(self, task: base.Task, timestep: float) -> None:
@@ -178,20 +169,13 @@ class SapienSimulation(HeldSimulation):
         self._body = self._system = self._scene = None
 
 
-class SapienSpringEngine(SapienEngine):
-    """PhysX 5 with an implicit coupling: the drives of a D6 joint."""
-
-    name = "physx_spring"
-    settings: Mapping[str, base.Advised] = {
-        **SapienEngine.settings,
-        "coupling": base.Advised(
-            "implicit spring: D6 joint, linear and slerp drives", f"{_GUIDE}: Joints, D6 Joint"
-        ),
-    }
-
-    def open(self, task: base.Task, timestep: float) -> SapienSimulation:
-        """Opens a task; see ``Engine.open``."""
-        return SapienSpringSimulation(task, timestep)
+SPRING_SETTINGS: Mapping[str, base.Advised] = {
+    **SETTINGS,
+    "coupling": base.Advised(
+        "implicit spring: D6 joint, linear and slerp drives", f"{_GUIDE}: Joints, D6 Joint"
+    ),
+}
+"""Settings with an implicit coupling: the drives of a D6 joint."""
 
 
 class SapienSpringSimulation(SapienSimulation):
@@ -225,7 +209,7 @@ class SapienSpringSimulation(SapienSimulation):
         """Returns nan: the drive's force changes with the solver's iterations."""
         return base.Wrench((math.nan,) * 3, (math.nan,) * 3)
 
-    def _couple(self, handle: Frame) -> None:
+    def _couple(self, handle: base.Frame) -> None:
         """Aims the drive at the handle, and steps."""
         if self._gains is not None:
             rate = 1.0 / self._timestep
@@ -259,4 +243,8 @@ def _collision(shape: base.Shape, pose: base.Pose, material: Any) -> Any:
 
 def engines() -> tuple[base.Engine, ...]:
     """Returns the engines of this module."""
-    return (SapienEngine(), SapienSpringEngine())
+    physx = f"PhysX 5 in SAPIEN {version('sapien')}"
+    return (
+        base.Engine("physx", physx, SETTINGS, SapienSimulation),
+        base.Engine("physx_spring", physx, SPRING_SETTINGS, SapienSpringSimulation),
+    )

@@ -14,7 +14,6 @@ import rapier3d
 
 from hapticbridge.kernel.pose import Vector
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.from_scene import HeldSimulation
 
 LENGTH = 1e-3
 """``length_unit`` in m, of which the allowed depth and the distance of prediction are shares. The
@@ -41,36 +40,25 @@ _GUIDE = "Rapier User Guide"
 _PARAMETERS = f"{_GUIDE}: Integration parameters"
 
 
-class RapierEngine:
-    """Rapier's default pipeline.
-
-    Its solver divides a step into as many parts as it has iterations, under one held force. Of its
-    models of friction the default is exact for a sliding box, "Coulomb" lets it slide with 0.85 of
-    the friction.
-    """
-
-    name = "rapier"
-    version = version("rapier3d")
-    settings: Mapping[str, base.Advised] = {
-        "coupling": base.Advised("held force", f"{_GUIDE}: Rigid-bodies, Forces and impulses"),
-        "length unit": base.Advised(
-            f"{LENGTH:g} m (default 1)", f"{_PARAMETERS}, which advises the size of most parts"
-        ),
-        "allowed linear error": base.Advised(f"{ALLOWED:g} of the unit", _PARAMETERS),
-        "contact softness": base.Advised(
-            f"{STIFFNESS:g} of the step's rate, damping ratio 10 (default 30 Hz)", _PARAMETERS
-        ),
-        "solver iterations": base.Advised(f"{ITERATIONS} (default 4)", _PARAMETERS),
-        "friction model": base.Advised("simplified (default)", _PARAMETERS),
-        "sleep": base.Advised("off", f"{_GUIDE}: Rigid-bodies, Sleeping"),
-    }
-
-    def open(self, task: base.Task, timestep: float) -> RapierSimulation:
-        """Opens a task; see ``Engine.open``."""
-        return RapierSimulation(task, timestep)
+SETTINGS: Mapping[str, base.Advised] = {
+    "coupling": base.Advised("held force", f"{_GUIDE}: Rigid-bodies, Forces and impulses"),
+    "length unit": base.Advised(
+        f"{LENGTH:g} m (default 1)", f"{_PARAMETERS}, which advises the size of most parts"
+    ),
+    "allowed linear error": base.Advised(f"{ALLOWED:g} of the unit", _PARAMETERS),
+    "contact softness": base.Advised(
+        f"{STIFFNESS:g} of the step's rate, damping ratio 10 (default 30 Hz)", _PARAMETERS
+    ),
+    "solver iterations": base.Advised(f"{ITERATIONS} (default 4)", _PARAMETERS),
+    "friction model": base.Advised("simplified (default)", _PARAMETERS),
+    "sleep": base.Advised("off", f"{_GUIDE}: Rigid-bodies, Sleeping"),
+}
+"""Settings of Rapier's default pipeline. Its solver divides a step into as many parts as it has
+iterations, under one held force. Of its models of friction the default is exact for a sliding box,
+"Coulomb" lets it slide with 0.85 of the friction."""
 
 
-class RapierSimulation(HeldSimulation):
+class RapierSimulation(base.Simulation):
     """A task in its own Rapier world."""
 
     def __init__(self, task: base.Task, timestep: float) -> None:
@@ -169,4 +157,4 @@ def _collider(shape: base.Shape, pose: base.Pose, friction: float) -> Any:
 
 def engines() -> tuple[base.Engine, ...]:
     """Returns the engines of this module."""
-    return (RapierEngine(),)
+    return (base.Engine("rapier", version("rapier3d"), SETTINGS, RapierSimulation),)

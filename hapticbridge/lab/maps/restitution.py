@@ -20,7 +20,6 @@ from matplotlib.lines import Line2D
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.errors import StudyError, choices
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
@@ -135,12 +134,7 @@ def drop(setting: str, angle: float, friction: float, slide: float) -> Rebound:
         angle: Angle of the rod above the floor in rad; π/2 is upright.
         friction: μ, >= 0, without unit.
         slide: Speed along the floor in m/s, > 0 towards the rod's upper end.
-
-    Raises:
-        StudyError: There is no such setting.
     """
-    if setting not in SETTINGS:
-        raise StudyError(f"no contact setting is called '{setting}'; it has {choices(SETTINGS)}")
     chosen = SETTINGS[setting]
     model, data = _rod()
     model.opt.timestep = chosen.timestep

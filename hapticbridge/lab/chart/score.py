@@ -1,4 +1,4 @@
-"""Workload and references of a chart: the simulated task and its scores."""
+"""Panels, takes and scores of a chart: what is compared, and how far it is off."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.check.perception import felt_error
-from hapticbridge.coupling import Coupling
 from hapticbridge.lab.chart.setting import Setting
 from hapticbridge.lab.engines.base import Task
 
@@ -209,44 +208,3 @@ class Run(Protocol):
 
     def scores(self) -> Mapping[str, Score]:
         """Judges the last run, by ``Panel.key``."""
-
-
-class References(Protocol):
-    """Limits to which the methods converge."""
-
-    def disagreement(self) -> dict[str, float]:
-        """Returns the distance in JND of each limit from the central one, by method."""
-
-
-class Workload(Protocol):
-    """Workload of a chart.
-
-    Attributes:
-        name: Name at the command line.
-        about: One sentence.
-        panels: At least one; the recommendation depends on the first.
-        coupling: Requested K and B.
-        has_contact: True if bodies can touch.
-        references: The methods' own limits, if a panel compares with them.
-    """
-
-    name: str
-    about: str
-    panels: Sequence[Panel]
-    coupling: Coupling
-    has_contact: bool
-    references: References | None
-
-    def run(self, setting: Setting) -> Run:
-        """Prepares a point.
-
-        Raises:
-            HapticBridgeError: The method cannot render this.
-        """
-
-    def peer_work(self) -> PeerWork:
-        """Returns the workload for other engines.
-
-        Raises:
-            StudyError: Other engines cannot represent it.
-        """
