@@ -251,12 +251,29 @@ OUTSIDE: Layout = {
 """Names as programs write them that know only absolute paths, and names that lead nowhere."""
 
 
+STEPPED: Layout = {
+    "scenes/main.xml": mjcf(
+        "<compiler meshdir='meshes' texturedir='looks'/>",
+        "<asset><hfield name='h' file='../heights/h.png' size='1 1 1 1'/>"
+        "<texture name='t' type='cube' file='../heights/h.png'/></asset>",
+        MESH.format("../parts/a.stl"),
+        body=MESHED,
+    ),
+    "scenes/meshes/b.stl": stl_bytes(),
+    "scenes/parts/a.stl": stl_bytes(),
+    "scenes/heights/h.png": png_bytes(),
+    "scenes/looks/t.png": png_bytes(),
+}
+"""Names with a step out of a folder of assets that stay in the folder of the scene."""
+
+
 @pytest.mark.parametrize("start", ["a file", "a relative name", "a specification"])
-def test_names_that_lead_out_of_the_folder_are_recorded_as_names_in_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: str
+@pytest.mark.parametrize("layout", [OUTSIDE, STEPPED], ids=["outside", "stepped"])
+def test_names_that_lead_out_of_a_folder_are_recorded_as_names_in_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: Layout, start: str
 ) -> None:
     folder = tmp_path / "user"
-    for name, content in OUTSIDE.items():
+    for name, content in layout.items():
         text = content.format(folder) if isinstance(content, str) else content
         scene_file(folder, text, name)
     monkeypatch.chdir(folder)
