@@ -315,14 +315,15 @@ def test_a_scene_that_is_too_large_for_a_confined_audit_is_said_to_need_another(
     assert any("--in-process" in str(each.message) for each in said) == (most == 1e6)
 
 
+@pytest.mark.parametrize("place", ["TemporaryDirectory", "Path.write_bytes"])
 def test_no_room_for_the_copy_is_said_and_the_run_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:
-    def full(**_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("hapticbridge.run.unpacked.TemporaryDirectory", full)
-    with pytest.warns(UserWarning, match="can be audited was not tried: No space left on device"):
+    monkeypatch.setattr(f"hapticbridge.run.unpacked.{place}", full)
+    with pytest.warns(UserWarning, match="can be audited was not tried: .*No space left on device"):
         recorded(tmp_path / "run.mcap", load_scene("point_mass"), duration=0.1)
     monkeypatch.undo()
     assert audit(tmp_path / "run.mcap").resimulation == "bit for bit"
