@@ -441,6 +441,8 @@ def test_a_run_of_a_specification_is_simulated_again_bit_for_bit(tmp_path: Path)
         ("/anywhere", "part.obj", "part.obj"),
         ("", "../part.obj", "../part.obj"),
         ("", "/anywhere/part.obj", "/anywhere/part.obj"),
+        ("sub", r"C:\anywhere\part.obj", "part.obj"),
+        (r"C:\anywhere", "part.obj", "part.obj"),
     ],
 )
 def test_an_asset_in_memory_is_recorded_where_its_element_names_it(
