@@ -182,6 +182,11 @@ def name_fault(path: Path, reader: str) -> str:
         os.fsencode(path).decode()
     except UnicodeDecodeError:
         return f"{reader} needs a name in UTF-8"
+    return encoding_words()
+
+
+def encoding_words() -> str:
+    """Returns what to say of a name that Python cannot read or write here."""
     encoding = sys.getfilesystemencoding()
     return f"Python reads names as {encoding} here; set PYTHONUTF8=1, or a locale with UTF-8"
 

@@ -562,6 +562,31 @@ def test_what_a_servo_carries_the_hand_does_not(tmp_path: Path, gain: float, is_
         assert length(sag) in told[0].sentence
 
 
+@pytest.mark.parametrize("spring", [0.0, 100.0, 1000.0])
+@pytest.mark.parametrize("holder", ["a tendon", "a servo of a tendon", "a servo of a site"])
+def test_what_a_spring_beside_the_joints_carries_the_hand_does_not(
+    tmp_path: Path, holder: str, spring: float
+) -> None:
+    is_tendon = holder == "a tendon"
+    rope = f'<tendon><spatial name="rope" stiffness="{spring if is_tendon else 0}">'
+    rope += '<site site="top"/><site site="grip"/></spatial></tendon>'
+    where = (
+        'tendon="rope"' if "tendon" in holder else 'site="grip" refsite="top" gear="0 0 1 0 0 0"'
+    )
+    start = 0.5 if "tendon" in holder else -0.5  # the servo is at its target
+    servo = f'<actuator><position {where} kp="{spring}"/></actuator>'
+    servo += f'<keyframe><key name="home" qpos="0" ctrl="{start}"/></keyframe>'
+    body = """<body name="tool"><joint type="slide" axis="0 0 1"/><geom size="0.01" mass="0.3"/>
+      <site name="grip"/></body>"""
+    text = mjcf(HEAVY, GOOD_CONTACT, rope, "" if is_tendon or not spring else servo, body=body,
+                world='<site name="top" pos="0 0 .5"/>')  # fmt: skip
+    told = [fault.sentence for fault in faults_in(tmp_path, text) if fault.kind == "heavy tool"]
+    sag = 0.3 * 9.81 / (2400.0 + spring)  # springs beside each other
+    assert len(told) == (sag > 1e-3)
+    for sentence in told:
+        assert number(2400.0 * sag) in sentence and f"by {length(sag)} at rest" in sentence
+
+
 @pytest.mark.parametrize(("active", "mass"), [("true", 0.55), ("false", None)])
 @pytest.mark.parametrize("tie", ['<weld body1="tool" body2="load" {}/>',
     '<connect body1="tool" body2="load" anchor="0 0 -.05" {}/>'])  # fmt: skip

@@ -127,6 +127,20 @@ def test_a_clock_that_was_set_back_in_a_bag_is_told(tmp_path: Path) -> None:
         read_bag(file)
 
 
+def test_a_clock_that_was_set_in_a_motion_is_told(tmp_path: Path) -> None:
+    """A machine without a clock of its own begins with the time since it was started."""
+    messages = [*ramp(1, start=5 * 10**9), *ramp(29)]
+    (file,) = bag(tmp_path / "walk", {"/hand": messages}).glob("*.mcap")
+    with pytest.raises(DeviceError, match="jumps by 11574 days after 1 of 30 poses"):  # 1e9/86400
+        read_bag(file)
+    rows = "".join(f"{0.01 * i + (1e9 if i > 12 else 0)},0,0,0\n" for i in range(30))
+    (tmp_path / "hand.csv").write_text("t,x,y,z\n" + rows)
+    with pytest.raises(DeviceError, match="jumps by 11574 days after 13 of 30 poses"):
+        read_motion(tmp_path / "hand.csv")
+    (tmp_path / "hand.csv").write_text("t,x,y,z\n" + rows.replace("1000000000.", "80000."))
+    assert read_motion(tmp_path / "hand.csv").duration == pytest.approx(80000.29)  # a long pause
+
+
 def test_of_several_topics_one_is_named(tmp_path: Path) -> None:
     folder = bag(tmp_path / "two: a, b", {"/hand/left": ramp(), "/hand/right": ramp(9)})
     (file,) = folder.glob("*.mcap")

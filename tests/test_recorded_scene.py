@@ -403,6 +403,26 @@ def test_an_attachment_that_cannot_lie_in_the_folder_is_named(
     assert words in reason and "\n" not in reason and "/tmp" not in reason.replace(str(path), "")
 
 
+@pytest.mark.parametrize(
+    ("refusal", "words"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "No space left on device"),
+        (OSError(errno.EROFS, "Read-only file system"), "Read-only file system"),
+        (UnicodeEncodeError("ascii", "ü", 0, 1, "no"), "set PYTHONUTF8=1"),
+    ],
+)
+def test_a_machine_that_cannot_hold_the_scene_leaves_an_honest_run_unverified(
+    refusal: Exception, words: str, honest: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> int:
+        raise refusal
+
+    monkeypatch.setattr(Path, "write_bytes", refused)
+    report = audit(honest.path, in_process=True)
+    assert report.verdict == "unverified"
+    assert words in report.reason
+
+
 def test_attachments_named_as_modules_are_not_imported(honest: Recording, tmp_path: Path) -> None:
     code = f"open({str(tmp_path / 'imported')!r}, 'w')".encode()
     names = ("numpy.py", "mujoco/__init__.py", "encodings.py", "sitecustomize.py")

@@ -329,6 +329,42 @@ def test_force_limit_of_a_joint_without_an_actuator_is_on_none(tmp_path: Path) -
     assert scene.changes[-1].endswith("→ none, as the scene has no actuator there")
 
 
+@pytest.mark.parametrize(
+    ("motor", "is_fixed"),
+    [
+        ("<motor name='m' joint='elbow'/>", True),
+        ("<motor name='m' tendon='cord'/>", True),
+        # no moment arm at the start: the force points to the hinge
+        ("<motor name='m' site='grip' refsite='base' gear='1 0 0 0 0 0'/>", False),
+        ("<motor name='m' site='grip' refsite='base' gear='0 1 0 0 0 0'/>", False),
+        ("<motor name='m' tendon='rope'/>", False),
+    ],
+)
+def test_force_limit_of_a_joint_tells_moment_arms_that_change(
+    tmp_path: Path, motor: str, *, is_fixed: bool
+) -> None:
+    text = mjcf(
+        "<tendon><fixed name='cord'><joint joint='elbow' coef='2'/></fixed>"
+        "<spatial name='rope'><site site='base'/><site site='grip'/></spatial></tendon>",
+        f"<actuator>{motor}</actuator>",
+        body=ARM_UNDER_LIMIT,
+        world="<site name='base' pos='0.2 0.3 0'/>",
+    )
+    scene, plain = load_scene(scene_file(tmp_path, text)), mujoco.MjModel.from_xml_string(text)
+    said = scene.changes[-1].endswith(
+        "on each of its actuators, for the moment arms of the start alone"
+    )
+    assert said == (not is_fixed)
+    # MuJoCo's own limit, at another angle
+    torques = []
+    for model in (scene.model, plain):
+        data = mujoco.MjData(model)
+        data.ctrl[0], data.qpos[0] = 100.0, 1.0
+        mujoco.mj_forward(model, data)
+        torques.append(float(data.qfrc_actuator[0]))
+    assert (torques[0] == pytest.approx(torques[1], rel=1e-9)) == is_fixed
+
+
 def test_force_limit_is_moved_on_the_way_to_the_grip_alone(tmp_path: Path) -> None:
     limit = "actuatorfrcrange='-1 1'"
     outer = f"<body name='stand'><joint name='base' {limit}/><geom size='.01'/>{ARM_UNDER_LIMIT}"

@@ -251,12 +251,29 @@ OUTSIDE: Layout = {
 """Names as programs write them that know only absolute paths, and names that lead nowhere."""
 
 
+STEPPED: Layout = {
+    "scenes/main.xml": mjcf(
+        "<compiler meshdir='meshes' texturedir='looks'/>",
+        "<asset><hfield name='h' file='../heights/h.png' size='1 1 1 1'/>"
+        "<texture name='t' type='cube' file='../heights/h.png'/></asset>",
+        MESH.format("../parts/a.stl"),
+        body=MESHED,
+    ),
+    "scenes/meshes/b.stl": stl_bytes(),
+    "scenes/parts/a.stl": stl_bytes(),
+    "scenes/heights/h.png": png_bytes(),
+    "scenes/looks/t.png": png_bytes(),
+}
+"""Names with a step out of a folder of assets that stay in the folder of the scene."""
+
+
 @pytest.mark.parametrize("start", ["a file", "a relative name", "a specification"])
-def test_names_that_lead_out_of_the_folder_are_recorded_as_names_in_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: str
+@pytest.mark.parametrize("layout", [OUTSIDE, STEPPED], ids=["outside", "stepped"])
+def test_names_that_lead_out_of_a_folder_are_recorded_as_names_in_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: Layout, start: str
 ) -> None:
     folder = tmp_path / "user"
-    for name, content in OUTSIDE.items():
+    for name, content in layout.items():
         text = content.format(folder) if isinstance(content, str) else content
         scene_file(folder, text, name)
     monkeypatch.chdir(folder)
@@ -298,14 +315,15 @@ def test_a_scene_that_is_too_large_for_a_confined_audit_is_said_to_need_another(
     assert any("--in-process" in str(each.message) for each in said) == (most == 1e6)
 
 
+@pytest.mark.parametrize("place", ["TemporaryDirectory", "Path.write_bytes"])
 def test_no_room_for_the_copy_is_said_and_the_run_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:
-    def full(**_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("hapticbridge.run.unpacked.TemporaryDirectory", full)
-    with pytest.warns(UserWarning, match="can be audited was not tried: No space left on device"):
+    monkeypatch.setattr(f"hapticbridge.run.unpacked.{place}", full)
+    with pytest.warns(UserWarning, match="can be audited was not tried: .*No space left on device"):
         recorded(tmp_path / "run.mcap", load_scene("point_mass"), duration=0.1)
     monkeypatch.undo()
     assert audit(tmp_path / "run.mcap").resimulation == "bit for bit"
@@ -423,6 +441,8 @@ def test_a_run_of_a_specification_is_simulated_again_bit_for_bit(tmp_path: Path)
         ("/anywhere", "part.obj", "part.obj"),
         ("", "../part.obj", "../part.obj"),
         ("", "/anywhere/part.obj", "/anywhere/part.obj"),
+        ("sub", r"C:\anywhere\part.obj", "part.obj"),
+        (r"C:\anywhere", "part.obj", "part.obj"),
     ],
 )
 def test_an_asset_in_memory_is_recorded_where_its_element_names_it(

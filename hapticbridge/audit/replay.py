@@ -43,6 +43,7 @@ from hapticbridge.run.description import (
 )
 from hapticbridge.run.posted_scene import PostedScene, posts_in
 from hapticbridge.run.slow_scene import SlowScene
+from hapticbridge.run.unpacked import NoRoomError
 from hapticbridge.scene import Scene
 from hapticbridge.scene.compile import clause
 
@@ -64,6 +65,7 @@ def attached_scene(recording: RecordingFile) -> Scene:
 
     Raises:
         ForeignModelError: Another processor compiled another model.
+        NoRoomError: This machine cannot hold the sources.
         RecordingError: The sources cannot be compiled, or give another model on this processor.
     """
     scene = compile_recorded(recording)
@@ -389,7 +391,7 @@ def _compared(hands: Sequence[AuditedHand], worker: Worker) -> ReplayOutcome:
     others = [(hand.recording, hand.run.parameters) for hand in hands[1:]]
     try:
         scene = attached_scene(recording)
-    except ForeignModelError as error:
+    except (ForeignModelError, NoRoomError) as error:
         return ReplayOutcome(Agreement.NOT_RUN, str(error))
     worker.allow_run()
     run = Resimulator(recording, parameters, scene, others)

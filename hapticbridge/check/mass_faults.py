@@ -13,9 +13,8 @@ from hapticbridge.check.case import STAND_IN_INERTIA, STAND_IN_MASS, SceneUnderC
 from hapticbridge.kernel.codes import held_body
 from hapticbridge.scene.fault import Fault, length, number, others, weight
 from hapticbridge.scene.handle import tied_trees
-from hapticbridge.scene.physics import (
-    body_inertia,
-)
+from hapticbridge.scene.physics import body_inertia
+from hapticbridge.scene.rehearsal import stiffness_without_hand
 
 WATER = 1000.0
 """Default density of a MuJoCo geom in kg/m³."""
@@ -151,7 +150,7 @@ def _load_ratios(case: SceneUnderCheck) -> Iterator[Fault]:
 
 
 def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Computes the tool's sag below the handle: (JᵀKJ + K_joints + K_servos) δq = the weight.
+    """Computes the tool's sag below the handle: (JᵀKJ + K_springs + K_servos) δq = the weight.
 
     Bodies of other trees that active welds and connects tie to the tool hang on it: A δq = 0 with
     the Jacobian A of these equalities.
@@ -170,18 +169,10 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     data.qvel[:] = 0.0
     bias = np.zeros(model.nv)
     mujoco.mj_rne(model, data, 0, bias)
-    springs = np.zeros(model.nv)
-    for joint in range(model.njnt):
-        if model.jnt_type[joint] in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE):
-            springs[model.jnt_dofadr[joint]] = float(np.ravel(model.jnt_stiffness[joint])[0])
-    for actuator in range(model.nactuator):  # a position servo holds its joint like a spring
-        if model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
-            joint = int(model.actuator_trnid[actuator, 0])
-            gain = max(-float(model.actuator_biasprm[actuator, 1]), 0.0)
-            springs[model.jnt_dofadr[joint]] += gain * float(model.actuator_gear[actuator, 0]) ** 2
     tool_jacobian = jacobian[:, dofs]
-    stiffness = tool_jacobian.T @ (gains[:, None] * tool_jacobian) + np.diag(springs[dofs])
+    stiffness = tool_jacobian.T @ (gains[:, None] * tool_jacobian)
     pulls = (data.qfrc_gravcomp - bias)[dofs]
+    stiffness += stiffness_without_hand(model, data, dofs, has_weight=False)
     free = _unconstrained(model, data, dofs) if tied else np.eye(dofs.size)
     moved = free @ np.linalg.lstsq(free.T @ stiffness @ free, free.T @ pulls, rcond=1e-9)[0]
     sag = float(np.linalg.norm(tool_jacobian[:3] @ moved))
@@ -196,9 +187,10 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     yield Fault(
         "heavy tool",
         case.places.body(int(of_tool[0])),  # the first that moves
-        f"{what} weighs {weight(mass)}; the part the hand carries, {number(pull)} N, stretches "
-        f"the coupling of {coupling.stiffness:.4g} N/m by {length(sag)} at rest; a run carries "
-        "it where the device cannot, and with --no-tool-weight",
+        f"{what} weighs {weight(mass)}; the hand carries {number(pull)} N of it where no contact, "
+        f"limit or dry friction does, and this stretches the coupling of {coupling.stiffness:.4g} "
+        f"N/m by {length(sag)} at rest; a run carries it where the device cannot, and with "
+        "--no-tool-weight",
         f'gravcomp="1" in {where}, or less mass',
     )
 

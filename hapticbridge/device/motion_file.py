@@ -203,7 +203,7 @@ def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
     """Returns a motion whose times are in s and lengths in m, as far as a hand's motion tells.
 
     Raises:
-        DeviceError: Lengths look like mm.
+        DeviceError: Lengths look like mm, or a clock was set between two rows.
 
     Warns:
         UserWarning: Times look like ms, µs or ns.
@@ -227,6 +227,12 @@ def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
             f"{_SMALLER[unit]:.0f}",
             stacklevel=3,
         )
+    elif len(table) >= MANY_ROWS and steps.max() > MAX_SILENCE * 1e-9:
+        before, days = int(steps.argmax()) + 1, steps.max() / 86_400
+        raise DeviceError(
+            f"{path}: the time jumps by {days:.0f} days after {before} of {len(table)} poses, as "
+            "where a clock is set; write the motion without those on one side"
+        )
     return Motion(table[:, 0], table[:, 1:4], table[:, 4:])
 
 
@@ -235,7 +241,7 @@ def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
 POSE = "geometry_msgs/msg/PoseStamped"
 
 MAX_SILENCE = 86_400 * 10**9
-"""Longest time in ns after a stamp of 0 at which the next one may be of the same, simulated clock:
+"""Longest time in ns between two stamps of one clock, as of a simulated one after its stamp of 0:
 a day. Unix time is beyond it."""
 
 _DAMAGED = ValueError, RuntimeError, EOFError, OverflowError, MemoryError, ZstdError

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path, PurePath
@@ -9,6 +10,7 @@ from tempfile import TemporaryDirectory
 
 from hapticbridge.confinement import MEMORY
 from hapticbridge.errors import HapticBridgeError, RecordingError, SceneWarning
+from hapticbridge.files import encoding_words
 from hapticbridge.run.description import SOURCE_PREFIX, attachments, model_digest
 from hapticbridge.run.request import RunRequest
 from hapticbridge.scene import Scene, load_scene, scene_parameters
@@ -23,6 +25,24 @@ LARGE = 0.4 * MEMORY
 its memory in textures, one was compiled and one refused."""
 
 
+_OF_MACHINE = {
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ENOMEM,
+    errno.EIO,
+}
+"""Numbers of errors for which no file name is the reason."""
+
+
+class NoRoomError(RecordingError):
+    """This machine cannot hold a recording's scene files, which says nothing of the recording."""
+
+
 def unpack_scene(recording: Path, files: Mapping[str, bytes], folder: Path) -> Path:
     """Writes a recording's scene files to a folder; returns the main file.
 
@@ -34,7 +54,8 @@ def unpack_scene(recording: Path, files: Mapping[str, bytes], folder: Path) -> P
         folder: Where the files are written.
 
     Raises:
-        RecordingError: The recording carries no scene, or files that cannot be written there.
+        NoRoomError: The folder has no room for them, or cannot have their names here.
+        RecordingError: The recording carries no scene, or files that cannot be written anywhere.
     """
     main: Path | None = None
     sources = {
@@ -61,9 +82,11 @@ def unpack_scene(recording: Path, files: Mapping[str, bytes], folder: Path) -> P
             path.write_bytes(data)
         except (OSError, ValueError, RecursionError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise RecordingError(
-                f"the attachment {name!r:.80} cannot be unpacked: {reason}"
-            ) from None
+            is_of_machine = getattr(error, "errno", None) in _OF_MACHINE
+            if isinstance(error, UnicodeEncodeError):
+                reason, is_of_machine = encoding_words(), True
+            words = f"the attachment {name!r:.80} cannot be unpacked: {reason}"
+            raise (NoRoomError if is_of_machine else RecordingError)(words) from None
         main = main or path
     if main is None:
         raise RecordingError(f"{recording} carries no scene, so it cannot be simulated again")
@@ -119,8 +142,9 @@ def warn_of_other_scene(
                 f"it takes {format_si(size, 'B')}, more than an audit allows a foreign scene: "
                 "audit the recording with --in-process, or make textures and meshes smaller"
             )
-    except OSError as error:  # such as no room for the copy
-        concern = f"whether the recording can be audited was not tried: {error.strerror}"
+    except (OSError, NoRoomError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        concern = f"whether the recording can be audited was not tried: {reason}"
     except HapticBridgeError as error:
         concern = f"the recording could not be audited: {error}"
     if concern:

@@ -375,6 +375,11 @@ def _constrain_flexes(spec: mujoco.MjSpec, *, as_is: bool) -> list[SceneChange]:
     return changes
 
 
+SAME_ARM = 1e-9
+"""Difference of two moment arms, in m or without unit, up to which they are one. Rounding leaves
+less; a larger value would call the arm of a small crank constant."""
+
+
 def limit_motors_alone(
     model: mujoco.MjModel, data: mujoco.MjData, grip: str, *, as_is: bool = False
 ) -> tuple[SceneChange, ...]:
@@ -383,7 +388,8 @@ def limit_motors_alone(
     MuJoCo's ``actuatorfrcrange`` limits the sum of all actuator forces on a joint, and the coupling
     is made of actuators. An actuator that alone drives a joint with moment arm g pushes within
     [a, b] on it if its own force is within [a, b]/g. Several actuators of one joint are limited
-    each by itself; gravity compensation is not limited.
+    each by itself; gravity compensation is not limited. Where g changes with the pose, as for a
+    site or a spatial tendon, the limit is that of the start.
 
     Args:
         model: The compiled scene; changed in place.
@@ -408,19 +414,24 @@ def limit_motors_alone(
             f"joint '{name}'{more} limits actuator forces (actuatorfrcrange), which would cap the "
             "coupling; limit the actuator's own forcerange, or let it be done (without --as-is)"
         )
-    moments = np.zeros((model.nout, model.nv))
-    mujoco.mju_sparse2dense(
-        moments,
-        data.actuator_moment,
-        data.moment_rownnz,
-        data.moment_rowadr,
-        data.moment_colind,
+    moved = mujoco.MjData(model)
+    mujoco.mj_copyData(moved, model, data)
+    mujoco.mj_integratePos(model, moved.qpos, np.linspace(0.1, 0.2, model.nv), 1.0)
+    mujoco.mj_fwdKinematics(model, moved)
+    mujoco.mj_transmission(model, moved)
+    moments, others, own = (
+        _moments(model, data),
+        _moments(model, moved),
+        np.ones(model.nactuator, bool),
     )
-    most = 0
+    own[list(added_actuators(model))] = False
+    most, is_fixed = 0, True
     for joint in joints:
         model.jnt_actfrclimited[joint] = 0
-        arms = moments[model.actuator_outadr, model.jnt_dofadr[joint]]
-        drivers = [i for i in np.flatnonzero(arms).tolist() if i not in added_actuators(model)]
+        column = model.actuator_outadr, model.jnt_dofadr[joint]
+        arms, later = moments[column] * own, others[column] * own
+        is_fixed &= np.allclose(arms, later, atol=SAME_ARM)
+        drivers = np.flatnonzero(arms).tolist()
         most = max(most, len(drivers))
         for actuator in drivers:
             low, high = sorted(model.jnt_actfrcrange[joint] / arms[actuator])
@@ -431,8 +442,23 @@ def limit_motors_alone(
             model.actuator_forcerange[actuator] = low, high
     places = ("none, as the scene has no actuator there", "on its actuator")
     place = places[most] if most < len(places) else "on each of its actuators"
+    if not is_fixed:
+        place = "on each of its actuators, for the moment arms of the start alone"
     words = f"force limit of joint '{name}'{more}: on all actuators together → {place}"
     return (SceneChange(words, "joint's force limit"),)
+
+
+def _moments(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
+    """Returns the moment arms of all outputs of actuators, (nout, nv)."""
+    moments = np.zeros((model.nout, model.nv))
+    mujoco.mju_sparse2dense(
+        moments,
+        data.actuator_moment,
+        data.moment_rownnz,
+        data.moment_rowadr,
+        data.moment_colind,
+    )
+    return moments
 
 
 def announce_gravity_compensation(model: mujoco.MjModel) -> tuple[SceneChange, ...]:

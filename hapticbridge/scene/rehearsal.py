@@ -303,7 +303,7 @@ def toppling_force(scene: Scene, parameters: RunParameters) -> float:
         return 0.0
     mujoco.mj_fullM(model, data, mass)
     root = np.linalg.inv(np.linalg.cholesky(mass[np.ix_(dofs, dofs)]))
-    stiffness = root @ _stiffness_without_hand(model, data, dofs) @ root.T
+    stiffness = root @ stiffness_without_hand(model, data, dofs) @ root.T
     squares, modes = np.linalg.eigh(0.5 * (stiffness + stiffness.T))
     mode = np.zeros(model.nv)
     mode[dofs] = root.T @ modes[:, 0]
@@ -319,10 +319,24 @@ def toppling_force(scene: Scene, parameters: RunParameters) -> float:
     return float(np.linalg.norm(wrenches.reshape(-1, 6)[:, :3].mean(axis=0)))  # it swings
 
 
-def _stiffness_without_hand(
+def stiffness_without_hand(
+    model: mujoco.MjModel, data: mujoco.MjData, dofs: NDArray[np.intp], *, has_weight: bool = True
+) -> NDArray[np.float64]:
+    """Returns −∂Q/∂q of some degrees of freedom at rest, without coupling and constraints.
+
+    Args:
+        model: The prepared scene; it is not changed.
+        data: Its state at rest; the positions are kept.
+        dofs: Degrees of freedom q.
+        has_weight: If false, the forces Q are without gravity.
+    """
+    with _gravity(model, is_on=has_weight):
+        return _stiffness(model, data, dofs)
+
+
+def _stiffness(
     model: mujoco.MjModel, data: mujoco.MjData, dofs: NDArray[np.intp]
 ) -> NDArray[np.float64]:
-    """Returns −∂Q/∂q of some degrees of freedom at rest, without the coupling."""
     start, own, columns = data.qpos.copy(), list(added_actuators(model)), []
     bias = model.actuator_biasprm[own].copy()
     model.actuator_biasprm[own] = 0.0

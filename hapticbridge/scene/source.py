@@ -205,6 +205,12 @@ class _Home:
             return self.folder
         return self.folder / self.folders["texturedir" if tag == "texture" else "meshdir"]
 
+    def file(self, tag: str, name: str) -> Path | None:
+        """Returns the file or folder that an element names, if there is one."""
+        places = _candidates(name, tag, (self.folder, self.folder), self.folders)
+        there = filter(os.path.exists, places)  # Path.exists fails for a name that is too long
+        return next(map(_key, there), None)
+
     def with_inner_names(self, data: bytes, depth: int, root: Path) -> bytes:
         """Returns an XML file with names that ``refuse_outside`` lets pass.
 
@@ -241,8 +247,9 @@ class _Home:
             if not _leads_out(name := unescape(match[group]), depth):
                 continue
             tag = _TAG.match(text, text.rfind("<", 0, match.start()) + 1)
-            home, file = self.of(tag[0] if tag else ""), _key(self.folder / name)
-            inner = os.path.relpath(file, _key(home)) if file.is_relative_to(root) else ""
+            element = tag[0] if tag else ""
+            home, file = _key(self.of(element)), self.file(element, name)
+            inner = os.path.relpath(file, home) if file and file.is_relative_to(root) else ""
             if ":" in _parts(inner)[0]:  # on Linux a letter of a name, and no drive
                 inner = f"./{inner}"
             yield match.span(group), name, inner

@@ -165,7 +165,8 @@ TREATMENTS: dict[str, Treatment] = {
     ),
     "joint's force limit": Treatment(
         "joint", "actuatorfrclimited, actuatorfrcrange", "changed",
-        "the same limit on its actuators, of joints that carry the grip",
+        "the same limit on its actuators, with their moment arms at the start, of joints that "
+        "carry the grip",
         "it would cap the coupling", stops=True,
     ),
     "joint's gravity compensation": Treatment(
