@@ -36,6 +36,11 @@ def format_number(value: float, digits: int = 4) -> str:
     return f"{float(f'{value:.{digits}g}'):.15g}"
 
 
+def format_degrees(radians: float, digits: int = 3) -> str:
+    """Formats an angle in degrees: ``140 deg``."""
+    return f"{format_number(math.degrees(radians), digits)} deg"
+
+
 def format_forces(hand: float | None, tool: float) -> str:
     """Names whose a force is: ``1.7 N on the hand, 5.67 N on the tool``.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -560,6 +561,21 @@ def test_what_a_servo_carries_the_hand_does_not(tmp_path: Path, gain: float, is_
     if told:  # the moment about the hinge: m g r = (K r² + K_r + k) sag / r
         sag = 0.8 * 9.81 * 0.05**2 / (2400 * 0.05**2 + 2.4 + gain)
         assert length(sag) in told[0].sentence
+
+
+@pytest.mark.parametrize(("mass", "is_told"), [(0.03, False), (0.1, True)])
+def test_a_head_held_off_its_centre_is_told_by_its_torque(
+    tmp_path: Path, mass: float, *, is_told: bool
+) -> None:
+    body = free(f'type="box" pos="0.3 0 0" size="0.015 0.015 0.04" mass="{mass}"')
+    found = faults_in(tmp_path, mjcf(HEAVY, GOOD_CONTACT, body=body))
+    told = [fault.sentence for fault in found if fault.kind == "heavy tool"]
+    assert bool(told) == is_told
+    if told:
+        torque = mass * 9.81 * 0.3
+        droop = f"{math.degrees(torque / 2.4):.2g} deg"
+        assert f"carries, {number(torque)} N m about the grip, turns the coupling" in told[0]
+        assert f"of 2.4 N m/rad by {droop} at rest" in told[0]
 
 
 @pytest.mark.parametrize(("active", "mass"), [("true", 0.55), ("false", None)])
