@@ -902,17 +902,25 @@ def test_energy_of_a_tendon_that_jumps_is_put_down_to_the_tendon(
         assert (fault.place.element, "damping" in fault.change) == ("tendon 'cord'", False)
 
 
-ARM_WITH_SENSORS = """<body name="arm"><joint type="slide" axis="0 0 1"/><site name="wrist"/>
+ARM_WITH_SENSORS = """<body name="arm"><joint name="lift" type="slide" axis="0 0 1"/>
+  <site name="wrist"/>
   <geom size="0.01" mass="0.05" {off}/><body name="hand" pos="0 0 -.1"><site name="grip"/>
     <geom size="0.01" mass="0.02" {off}/></body>
-  <body name="finger" pos=".1 0 0"><joint axis="0 1 0" damping="1"/><site name="pad"/>
+  <body name="finger" pos=".1 0 0"><joint name="bend" axis="0 1 0" damping="1"/><site name="pad"/>
     <geom size="0.01" mass="0.02" {off}/></body></body>"""
 
 
 def test_sensor_that_carries_the_grip_is_told_to_read_the_coupling(tmp_path: Path) -> None:
     sensors = """<sensor><force name="at wrist" site="wrist"/><torque name="too" site="wrist"/>
-      <force name="at pad" site="pad"/><framepos objtype="site" objname="wrist"/></sensor>"""
+      <force name="at pad" site="pad"/><framepos objtype="site" objname="wrist"/>
+      <jointactuatorfrc name="of lift" joint="lift"/>
+      <jointactuatorfrc name="of finger" joint="bend"/></sensor>"""
     body = ARM_WITH_SENSORS.format(off='contype="0" conaffinity="0"')
     text = mjcf(GOOD_OPTION, GOOD_CONTACT, sensors, body=body)
     told = [fault for fault in faults_in(tmp_path, text) if fault.kind == "force sensor"]
-    assert [fault.place.element for fault in told] == ["force 'at wrist'", "torque 'too'"]
+    assert [fault.place.element for fault in told] == [
+        "force 'at wrist'",
+        "torque 'too'",
+        "jointactuatorfrc 'of lift'",
+    ]
+    assert "'of lift' is of a joint that moves the grip" in told[2].sentence
