@@ -14,6 +14,7 @@ from check_scenes import (
     GOOD_CONTACT,
     GOOD_OPTION,
     KEY,
+    LEAPING,
     PLANTS,
     Plant,
     bench,
@@ -878,15 +879,6 @@ def test_convex_pieces_open_the_hole_that_a_hull_fills(tmp_path: Path) -> None:
     assert depths[1] < 0.055
     mended = faults_in(tmp_path, text.format(f"{open_to_air}/>{boxes}"), down)
     assert "mesh not convex" not in kinds(mended)
-
-
-LEAPING = """<body name="pelvis" quat=".7071 .7071 0 0"><site name="a" pos="-.0655 .0138 -.0605"/>
-<geom name="brim" type="cylinder" size=".0549 .05" pos="-.071 -.065 -.0756"
-  quat=".8743 .1938 .0376 .4434"/>
-<body name="tool" pos="-.046 -.068 -.067"><joint type="slide" axis="1 0 0" damping="10"/>
-  <joint type="slide" axis="0 1 0" damping="10"/><joint type="slide" axis="0 0 1" damping="10"/>
-  <geom size=".01" mass=".1" contype="0" conaffinity="0"/><site name="grip"/>
-  <site name="b" pos=".002 -.054 .0057"/></body></body>"""
 
 
 @pytest.mark.parametrize(("geom", "is_told"), [('<geom geom="brim"/>', True), ("", False)])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
@@ -29,8 +29,9 @@ from hapticbridge.report.evidence import Evidence
 from hapticbridge.run.commands import UNITS
 from hapticbridge.scene.checks import first_pump, unmetered_work
 from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
+from hapticbridge.scene.physics import STEADY_WAY, Lengths
 from hapticbridge.theory.bounds import NEEDED_SHARE
-from hapticbridge.units import format_energy
+from hapticbridge.units import format_energy, format_si
 
 Kind = Literal[
     "method",
@@ -42,6 +43,7 @@ Kind = Literal[
     "damping",
     "quantisation",
     "unmetered work",
+    "jumping tendon",
     "unknown",
 ]
 
@@ -249,21 +251,31 @@ def touched_pairs(
         return None
     if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
         return None
-    ticks, total = evidence.ticks, float(gained.sum())
+    total = float(gained.sum())
     found: defaultdict[frozenset[int], float] = defaultdict(float)
     try:
-        run = Resimulator(evidence.recording, AuditedRun.of(evidence.recording).parameters)
-        for begin in range(0, window.start, BLOCK):
-            run.add(ticks[begin : min(begin + BLOCK, window.start)])
-        for tick, energy in zip(range(window.start, window.stop), gained.tolist(), strict=True):
-            run.add(ticks[tick : tick + 1])
-            contact = run.data.contact
-            touching = contact.geom[contact.efc_address >= 0].tolist()
+        for data, energy in zip(_states_in(evidence, window), gained.tolist(), strict=True):
+            touching = data.contact.geom[data.contact.efc_address >= 0].tolist()
             for pair in {frozenset(geoms) for geoms in touching}:
                 found[pair] += energy / total if total > 0 else 0.0
     except RecordingError:
         return None
     return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def _states_in(evidence: Evidence, window: slice) -> Iterator[mujoco.MjData]:
+    """Simulates a run again; yields the scene after each tick of the window.
+
+    Raises:
+        RecordingError: It cannot be simulated.
+    """
+    ticks = evidence.ticks
+    run = Resimulator(evidence.recording, AuditedRun.of(evidence.recording).parameters)
+    for begin in range(0, window.start, BLOCK):
+        run.add(ticks[begin : min(begin + BLOCK, window.start)])
+    for tick in range(window.start, window.stop):
+        run.add(ticks[tick : tick + 1])
+        yield run.data
 
 
 # Causes of energy created in the environment
@@ -293,7 +305,8 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
             "damps their contacts and welds against rest, so a fast move creates energy",
             "move them slower",
         )
-    if cause := _cause_of_scene(evidence, report, where):
+    own = _cause_of_scene(evidence, report, where)
+    if cause := own or _jump_cause(evidence, report, window, gained):
         return cause
     if share < MOST:
         return _cause_without_contact(evidence, window, where)
@@ -320,6 +333,44 @@ def _cause_of_scene(evidence: Evidence, report: AuditReport, where: str) -> Caus
         for name, clause in unmetered_work(model).items()
     ]
     return found[0] if found else None
+
+
+def _jump_cause(
+    evidence: Evidence, report: AuditReport, window: slice, gained: NDArray[np.float64]
+) -> Cause | None:
+    """Returns a tendon that jumps as the cause, if its jumps brought most of the energy.
+
+    A jump stretches the tendon's spring, or breaks its limit or constraint, without any work.
+    """
+    model, total = evidence.model, float(gained.sum())
+    if model is None or not model.ntendon or total <= 0.0:
+        return None
+    if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
+        return None
+    at_jump, largest = np.zeros((model.ntendon, gained.size)), np.zeros(model.ntendon)
+    last: Lengths | None = None
+    try:
+        for tick, data in enumerate(_states_in(evidence, window)):
+            now = Lengths.of(data)
+            if last is not None:
+                for tendon, size in now.jumps_since(last, evidence.parameters.period).items():
+                    at_jump[tendon, max(tick - 1, 0) : tick + 2] = 1.0  # lengths lag by a step
+                    largest[tendon] = max(largest[tendon], size)
+            last = now
+    except RecordingError:
+        return None
+    shares = at_jump @ gained / total
+    tendon = int(np.argmax(shares))
+    if shares[tendon] < MOST:
+        return None
+    name = model.tendon(tendon).name or str(tendon)
+    return Cause(
+        "jumping tendon",
+        f"{shares[tendon]:.0%} of the energy created until then came as the length of tendon "
+        f"'{name}' jumped, by up to {format_si(largest[tendon], 'm')} in one tick: its way round a "
+        "geom changed",
+        f"write {STEADY_WAY}",
+    )
 
 
 def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
