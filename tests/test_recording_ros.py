@@ -240,3 +240,25 @@ def test_order_of_topics_and_metadata_is_no_damage_but_what_they_say_and_ticks_b
     assert read_recording(path).problems == (
         "its ticks are not in order: tick 1499 is followed by tick 1498",
     )
+
+
+def test_stamps_keep_their_last_second_in_2038_and_log_times_go_on(tmp_path: Path) -> None:
+    """The seconds of a stamp are a signed number of 32 bits, whose last is 2^31 - 1."""
+    path, begin = tmp_path / "late.mcap", 2**31 * 10**9 - 100_000_000
+    writer = RecordingWriter(path, META, (), begin)
+    writer.write_event({"event": "start"}, 0)
+    writer.write_ticks(random_rows(300))
+    writer.write_event({"event": "mark"}, 300_000_000)
+    writer.close()
+    found = decoded(path)
+    last = (2**31 - 1, 999_999_999)
+    for topic in ("/tool_pose", "/rosout"):
+        stamps = [
+            (stamp.sec, stamp.nanosec)
+            for _, value in found[topic]
+            for stamp in [value.stamp if topic == "/rosout" else value.header.stamp]
+        ]
+        times = [time for time, _ in found[topic]]
+        assert max(times) > 2**31 * 10**9
+        assert stamps == [min(divmod(time, 10**9), last) for time in times]
+    assert read_recording(path).problems == ()
