@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
-from hapticbridge.files import import_extra, read_json
+from hapticbridge.files import foreign_kind, import_extra, read_json
 from hapticbridge.kernel.record import FLAG_LEGEND, SECONDS, TICK_DTYPE, TableColumns
 from hapticbridge.recording import format as layout
 from hapticbridge.recording import ros_messages
@@ -550,6 +550,14 @@ def _read_through(
     return facts, contents.attachments
 
 
+def foreign_file(path: Path) -> str:
+    """Returns the kind of a bag or packed file, as ``files.foreign_kind``, for who reads runs."""
+    kind = foreign_kind(path)
+    if kind.startswith("a bag"):
+        kind += " as a motion; only what 'hapticbridge run' wrote is a recording"
+    return kind
+
+
 def _hands_in(path: Path, meta: Mapping[str, str], hand: int | None, problems: list[str]) -> int:
     """Returns the number of hands in a file; damaged metadata count as one hand.
 
@@ -580,6 +588,8 @@ def _read_parts(
     """Reads a file; yields its container and contents after every part."""
     with FileBytes(path) as data:
         if data[: len(MAGIC)] != MAGIC:
+            if kind := foreign_file(path):
+                raise RecordingError(f"{path} is {kind}")
             what = "it is empty" if not len(data) else "it does not start with the MCAP magic"
             raise RecordingError(f"{path} is not an MCAP file: {what}")
         container = Container(data)
