@@ -220,8 +220,11 @@ class Contents:
             self._derived.add(ros_messages.LOG, *line)
 
     def _expected(self) -> ros_messages.Messages | None:
-        """Returns what derives the messages for ROS 2; None for a file without them."""
-        if not self.has_messages or not self.keeps_events or self.meta_ahead is None:
+        """Returns what derives the messages for ROS 2; None if they are not compared.
+
+        A file without summary may name them behind its ticks and events, so all are derived.
+        """
+        if not self.keeps_events or self.meta_ahead is None:
             return None
         if self._messages is None:
             axes = ros_messages.axes_of(self.meta_ahead)
@@ -230,7 +233,9 @@ class Contents:
 
     def message_fault(self) -> str:
         """Returns a sentence if the messages for ROS 2 do not follow from the ticks; else empty."""
-        if differing := self._expected() and self._written.differing(self._derived):
+        if not self.has_messages or self._expected() is None:
+            return ""
+        if differing := self._written.differing(self._derived):
             return f"what {choices(differing)} say does not follow from the ticks and events"
         return ""
 
