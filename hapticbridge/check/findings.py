@@ -33,6 +33,7 @@ from hapticbridge.scene.first_faults import (
     unit_faults,
 )
 from hapticbridge.scene.treatment import Treatment
+from hapticbridge.units import format_count
 
 # Faults of options, start, and motion without a hand
 
@@ -183,5 +184,7 @@ def find_faults(case: SceneUnderCheck) -> tuple[Fault, ...]:
     units = [fault for fault in faults if fault.kind == UNITS]
     if not units or len(faults) == len(units):
         return tuple(faults)
-    waiting = f"; {len(faults) - len(units)} more findings wait until this is mended"
+    more = len(faults) - len(units)
+    verb = "waits" if more == 1 else "wait"
+    waiting = f"; {format_count(more, 'more finding')} {verb} until this is mended"
     return tuple(replace(fault, sentence=fault.sentence + waiting) for fault in units)

@@ -17,7 +17,7 @@ from hapticbridge.scene.physics import (
     body_inertia,
 )
 from hapticbridge.scene.rehearsal import wrench_sizes
-from hapticbridge.units import format_degrees
+from hapticbridge.units import format_degrees, format_number
 
 WATER = 1000.0
 """Default density of a MuJoCo geom in kg/m³."""
@@ -149,7 +149,7 @@ def _load_ratios(case: SceneUnderCheck) -> Iterator[Fault]:
                 place,
                 f"{place.element} ({weight(own)}) carries {name} ({weight(load)}), "
                 f"1 to {number(load / own)}: its motion is computed from small differences",
-                f'mass="{load / MAX_RATIO:.3g}" or more in it',
+                f'mass="{format_number(load / MAX_RATIO, 3)}" or more in it',
             )
 
 
@@ -192,12 +192,13 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     if sag > MAX_SAG:
         parts.append(
             f"{number(sag * coupling.stiffness)} N, stretches the coupling of "
-            f"{coupling.stiffness:.4g} N/m by {length(sag)}"
+            f"{format_number(coupling.stiffness)} N/m by {length(sag)}"
         )
     if droop > MAX_DROOP:
         parts.append(
             f"{number(droop * coupling.rotational_stiffness)} N m about the grip, turns the "
-            f"coupling of {coupling.rotational_stiffness:.4g} N m/rad by {format_degrees(droop, 2)}"
+            f"coupling of {format_number(coupling.rotational_stiffness)} N m/rad by "
+            f"{format_degrees(droop, 2)}"
         )
     if not parts:
         return

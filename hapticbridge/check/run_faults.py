@@ -13,6 +13,7 @@ from hapticbridge.scene.checks import unmetered_work
 from hapticbridge.scene.contacts import suggested_solref
 from hapticbridge.scene.fault import Fault, length, number
 from hapticbridge.scene.physics import STEADY_WAY
+from hapticbridge.units import format_count
 
 ITERATIONS = 100
 """MuJoCo's default limit of solver iterations. Newton's solver takes 1 to 8 in the shipped
@@ -55,7 +56,7 @@ def run_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         yield Fault(
             "MuJoCo warning",
             option("timestep"),
-            f"MuJoCo warned {count} times in the motion: {words}",
+            f"MuJoCo warned {format_count(count, 'time')} in the motion: {words}",
             "follow the warning's advice",
         )
     yield from _falling_bodies(case, seen)

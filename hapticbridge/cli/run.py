@@ -167,8 +167,8 @@ def _announce_damping(setup: RunSetup, named: Mapping[str, float]) -> None:
         least = getattr(setup.attainable, name)
         if name in named and named[name] < least * (1.0 - 1e-9):
             err.print(
-                f"  {symbol} = {named[name]:g} {unit} is less than the {least:.4g} that method "
-                f"{setup.method.name} shows at this stiffness and rate"
+                f"  {symbol} = {named[name]:g} {unit} is less than the {format_number(least)} that "
+                f"method {setup.method.name} shows at this stiffness and rate"
             )
 
 
@@ -188,8 +188,9 @@ def _announce_own_rate(setup: RunSetup) -> None:
     usual = default_coupling(info, own, *scales, setup.law_evaluations, method)
     if usual.stiffness > setup.coupling.stiffness:
         err.print(
-            f"  the device gives {1 / own:.4g} new samples per second, and each force is held: "
-            f"--rate {format_number(1 / own)} would allow {format_number(usual.stiffness, 3)} N/m"
+            f"  the device gives {format_number(1 / own)} new samples per second, and each force "
+            f"is held: --rate {format_number(1 / own)} would allow "
+            f"{format_number(usual.stiffness, 3)} N/m"
         )
 
 
@@ -197,12 +198,13 @@ def _announce_slow(setup: RunSetup) -> None:
     rate, scales = 1.0 / setup.scene_period, setup.workspace.scales
     if setup.credit:
         err.print(
-            f"  another program shows its tool, {rate:.4g} times per second or as it can; the hand "
-            f"gets at most what it put in plus {format_energy(setup.credit)}"
+            f"  another program shows its tool, {format_number(rate)} times per second or as it "
+            f"can; the hand gets at most what it put in plus {format_energy(setup.credit)}"
         )
         return
     err.print(
-        f"  the scene steps at {rate:.4g} Hz beside the loop, and its tool is shown in between"
+        f"  the scene steps at {format_number(rate)} Hz beside the loop, and its tool is shown in "
+        "between"
     )
     most = steady_stiffness(setup.scene, setup.info, setup.scene_period, *scales)
     if setup.coupling.stiffness > 2.0 * most:
@@ -214,7 +216,8 @@ def _announce_slow(setup: RunSetup) -> None:
     if setup.coupling.rotational_stiffness > 2.0 * most:
         err.print(
             "[yellow]warning:[/yellow] at this scene rate the tool may shake above about "
-            f"{2.0 * most:.2g} N m/rad: lower --rotational-stiffness, or raise --scene-rate"
+            f"{format_number(2.0 * most, 2)} N m/rad: lower --rotational-stiffness, or raise "
+            "--scene-rate"
         )
 
 
@@ -547,8 +550,9 @@ class Run:
         is_own = any(info.loop_period is not None for info in infos)
         if self.options.rate is None and options.loop_rate < USUAL_RATE and not is_own:
             notify(
-                f"the loop runs at {options.loop_rate:.4g} Hz, as often as the device has a new "
-                f"sample: it bears stiffer walls so than at {USUAL_RATE:g} Hz (--rate sets another)"
+                f"the loop runs at {format_number(options.loop_rate)} Hz, as often as the device "
+                f"has a new sample: it bears stiffer walls so than at {USUAL_RATE:g} Hz (--rate "
+                "sets another)"
             )
         return replace(self, options=options)
 

@@ -31,7 +31,7 @@ from hapticbridge.scene.checks import first_pump, unmetered_work
 from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
 from hapticbridge.scene.physics import STEADY_WAY, Lengths
 from hapticbridge.theory.bounds import NEEDED_SHARE
-from hapticbridge.units import format_energy, format_si
+from hapticbridge.units import format_count, format_energy, format_number, format_si
 
 Kind = Literal[
     "method",
@@ -119,7 +119,7 @@ def _method_cause(method: Method, where: str = "") -> Cause:
 def _failing_words(failing: list[DampingCondition]) -> str:
     return "; ".join(
         f"{c.axis}: the device's damping is {c.available:g} {UNITS[c.axis][1]}, the coupling needs "
-        f"{c.needed:.4g}"
+        f"{format_number(c.needed)}"
         for c in failing
     )
 
@@ -139,8 +139,9 @@ def _delay_cause(evidence: Evidence, failing: list[DampingCondition]) -> Cause |
         return None
     return Cause(
         "delay",
-        f"{prompt:.3g} N s/m of damping would bear the coupling without delay, the device has "
-        f"{own:.3g}; its samples are {late} ticks old; {_failing_words(failing)}",
+        f"{format_number(prompt, 3)} N s/m of damping would bear the coupling without delay, the "
+        f"device has {format_number(own, 3)}; its samples are {late} ticks old; "
+        f"{_failing_words(failing)}",
         f"shorten the delay, or {_remedies(failing)}",
     )
 
@@ -152,7 +153,8 @@ def _overload_cause(evidence: Evidence, failing: list[DampingCondition]) -> Caus
     if failing[0].axis == "translation" and damper > NEEDED_SHARE * own:
         return Cause(
             "damping",
-            f"{_failing_words(failing)}; its damper alone needs {damper:.4g} at any rate",
+            f"{_failing_words(failing)}; its damper alone needs {format_number(damper)} at any "
+            "rate",
             _remedies(failing),
         )
     return Cause(
@@ -182,8 +184,8 @@ def _timing_cause(evidence: Evidence, window: slice) -> Cause | None:
     if missed:
         return Cause(
             "rate",
-            f"ticks late by a period or more in the {span:.2g} s before: {missed}, so that the "
-            "wrench was held longer than the coupling allows",
+            f"ticks late by a period or more in the {format_number(span, 2)} s before: {missed}, "
+            "so that the wrench was held longer than the coupling allows",
             "lower the rate or the load of the machine ('hapticbridge doctor')",
         )
     repeated = float(np.mean((flags & int(TickFlag.STALE_SAMPLE)) != 0))
@@ -193,8 +195,9 @@ def _timing_cause(evidence: Evidence, window: slice) -> Cause | None:
     if repeated > expected + FEWEST_REPEATS:
         return Cause(
             "delay",
-            f"{repeated:.0%} of the samples in the {span:.2g} s before repeated an older one, "
-            f"{expected:.0%} are expected: the force followed an older position of the handle",
+            f"{repeated:.0%} of the samples in the {format_number(span, 2)} s before repeated an "
+            f"older one, {expected:.0%} are expected: the force followed an older position of the "
+            "handle",
             "mend the link to the device, or lower the rate to what it delivers",
         )
     return None
@@ -229,7 +232,7 @@ def _quantisation_words(evidence: Evidence, window: slice) -> str:
     return (
         f"{share:.0%} of the energy came in ticks whose motion was {COUNTED:g} steps of the "
         f"device's resolution ({info.resolution:g} m) or less; to hold still between steps takes a "
-        f"friction of K D/2 + B_law D/T = {rub:.3g} N, the device's is {has}"
+        f"friction of K D/2 + B_law D/T = {format_number(rub, 3)} N, the device's is {has}"
     )
 
 
@@ -380,9 +383,9 @@ def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cau
     if turned > FAST_TURN:
         return Cause(
             "rate",
-            f"{where}; the tool turned by up to {turned:.2g} rad a tick "
-            f"({turned / evidence.parameters.period:.3g} rad/s), and MuJoCo takes the gyroscopic "
-            "torque from the start of a step",
+            f"{where}; the tool turned by up to {format_number(turned, 2)} rad a tick "
+            f"({format_number(turned / evidence.parameters.period, 3)} rad/s), and MuJoCo takes "
+            "the gyroscopic torque from the start of a step",
             "raise the rate, or turn the tool slower",
         )
     return Cause(
@@ -406,7 +409,8 @@ def _pair_words(evidence: Evidence, pairs: Pairs) -> str:
     if evidence.model is None:
         return ""
     touching = " touched ".join(geom_name(evidence.model, geom) for geom in sorted(pair))
-    more = f" ({len(pairs) - 1} other pairs touched, too)" if len(pairs) > 1 else ""
+    others = format_count(len(pairs) - 1, "other pair")
+    more = f" ({others} touched, too)" if len(pairs) > 1 else ""
     return f", {share:.0%} while {touching}{more}"
 
 

@@ -83,7 +83,7 @@ from hapticbridge.scene.rehearsal import (
     toppling_force,
     wrench_sizes,
 )
-from hapticbridge.units import format_si
+from hapticbridge.units import format_count, format_number, format_si
 
 # Options of a user
 
@@ -467,7 +467,7 @@ def _refuse_buttons(options: BridgeOptions, info: DeviceInfo, *, is_recorded: bo
         if button is not None and info.buttons is not None and button >= info.buttons:
             raise DeviceError(
                 f"{name.replace('_', '-')} is button {button}, and the device '{info.name}' "
-                f"has {info.buttons} buttons, numbered from 0"
+                f"has {format_count(info.buttons, 'button')}, numbered from 0"
             )
 
 
@@ -713,7 +713,7 @@ class RunSetup(StepTimes):
         if (force := float(self.on_device((toppling_force(scene, parameters), 0.0))[0])) > most[0]:
             return (
                 f"it stands upright and topples: {TIPPED:g} m beside, it pulls with "
-                f"{force:.3g} N, and the device holds {most[0]:.3g} N"
+                f"{format_number(force, 3)} N, and the device holds {format_number(most[0], 3)} N"
             )
         return ""
 
