@@ -191,6 +191,41 @@ def encoding_words() -> str:
     return f"Python reads names as {encoding} here; set PYTHONUTF8=1, or a locale with UTF-8"
 
 
+# Files of other programs
+
+_UNPACKED = "compressed as a whole file; what {} makes of it is read"
+_ZSTD = b"\x28\xb5\x2f\xfd", _UNPACKED.format("'zstd -d'")
+_FOREIGN = {
+    ".db3": (
+        b"SQLite format 3\0",
+        "a bag of ROS 2 in SQLite; 'ros2 bag convert' writes it in MCAP, which is read",
+    ),
+    ".bag": (
+        b"#ROSBAG V",
+        "a bag of ROS 1; 'rosbags-convert --dst-storage mcap' makes it one of ROS 2 in MCAP, which "
+        "is read",
+    ),
+    ".zstd": _ZSTD,
+    ".zst": _ZSTD,
+    ".gz": (b"\x1f\x8b", _UNPACKED.format("'gunzip'")),
+}
+"""First bytes of a kind of file, and its name with what makes it readable, by its ending."""
+
+
+def foreign_kind(path: Path) -> str:
+    """Returns the kind of a bag or packed file that is not read, and what makes it readable.
+
+    The kind follows from the file's first bytes or its ending. It is empty for any other file.
+    """
+    start = b""
+    with suppress(OSError, ValueError):
+        if path.is_file():
+            with path.open("rb") as file:
+                start = file.read(16)
+    kinds = (kind for begin, kind in _FOREIGN.values() if start.startswith(begin))
+    return next(kinds, _FOREIGN.get(path.suffix, (b"", ""))[1])
+
+
 def draft_of(target: Path) -> Path:
     """Returns the place of a file or folder until it is whole.
 

@@ -36,6 +36,16 @@ def format_number(value: float, digits: int = 4) -> str:
     return f"{float(f'{value:.{digits}g}'):.15g}"
 
 
+def format_count(count: int, noun: str) -> str:
+    """Formats a number of things, whose plural ends in s: ``1 pair``, ``2 pairs``."""
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def format_degrees(radians: float, digits: int = 3) -> str:
+    """Formats an angle in degrees: ``140 deg``."""
+    return f"{format_number(math.degrees(radians), digits)} deg"
+
+
 def format_forces(hand: float | None, tool: float) -> str:
     """Names whose a force is: ``1.7 N on the hand, 5.67 N on the tool``.
 

@@ -219,3 +219,13 @@ def peg_with(folder: Path, solref: str) -> Path:
     path = folder / source.name
     path.write_text(source.read_text(encoding="utf-8").replace('"0.002 1"', f'"{solref}"'))
     return path
+
+
+LEAPING = """<body name="pelvis" quat=".7071 .7071 0 0"><site name="a" pos="-.0655 .0138 -.0605"/>
+<geom name="brim" type="cylinder" size=".0549 .05" pos="-.071 -.065 -.0756"
+  quat=".8743 .1938 .0376 .4434"/>
+<body name="tool" pos="-.046 -.068 -.067"><joint type="slide" axis="1 0 0" damping="10"/>
+  <joint type="slide" axis="0 1 0" damping="10"/><joint type="slide" axis="0 0 1" damping="10"/>
+  <geom size=".01" mass=".1" contype="0" conaffinity="0"/><site name="grip"/>
+  <site name="b" pos=".002 -.054 .0057"/></body></body>"""
+"""A tool whose cord from site a to b leaves the brim at once."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +14,7 @@ from check_scenes import (
     GOOD_CONTACT,
     GOOD_OPTION,
     KEY,
+    LEAPING,
     PLANTS,
     Plant,
     bench,
@@ -587,6 +589,21 @@ def test_what_a_spring_beside_the_joints_carries_the_hand_does_not(
         assert number(2400.0 * sag) in sentence and f"by {length(sag)} at rest" in sentence
 
 
+@pytest.mark.parametrize(("mass", "is_told"), [(0.03, False), (0.1, True)])
+def test_a_head_held_off_its_centre_is_told_by_its_torque(
+    tmp_path: Path, mass: float, *, is_told: bool
+) -> None:
+    body = free(f'type="box" pos="0.3 0 0" size="0.015 0.015 0.04" mass="{mass}"')
+    found = faults_in(tmp_path, mjcf(HEAVY, GOOD_CONTACT, body=body))
+    told = [fault.sentence for fault in found if fault.kind == "heavy tool"]
+    assert bool(told) == is_told
+    if told:
+        torque = mass * 9.81 * 0.3
+        droop = f"{math.degrees(torque / 2.4):.2g} deg"
+        assert f"carries {number(torque)} N m about the grip, which turns the coupling" in told[0]
+        assert f"of 2.4 N m/rad by {droop} at rest" in told[0]
+
+
 @pytest.mark.parametrize(("active", "mass"), [("true", 0.55), ("false", None)])
 @pytest.mark.parametrize("tie", ['<weld body1="tool" body2="load" {}/>',
     '<connect body1="tool" body2="load" anchor="0 0 -.05" {}/>'])  # fmt: skip
@@ -889,15 +906,6 @@ def test_convex_pieces_open_the_hole_that_a_hull_fills(tmp_path: Path) -> None:
     assert "mesh not convex" not in kinds(mended)
 
 
-LEAPING = """<body name="pelvis" quat=".7071 .7071 0 0"><site name="a" pos="-.0655 .0138 -.0605"/>
-<geom name="brim" type="cylinder" size=".0549 .05" pos="-.071 -.065 -.0756"
-  quat=".8743 .1938 .0376 .4434"/>
-<body name="tool" pos="-.046 -.068 -.067"><joint type="slide" axis="1 0 0" damping="10"/>
-  <joint type="slide" axis="0 1 0" damping="10"/><joint type="slide" axis="0 0 1" damping="10"/>
-  <geom size=".01" mass=".1" contype="0" conaffinity="0"/><site name="grip"/>
-  <site name="b" pos=".002 -.054 .0057"/></body></body>"""
-
-
 @pytest.mark.parametrize(("geom", "is_told"), [('<geom geom="brim"/>', True), ("", False)])
 def test_energy_of_a_tendon_that_jumps_is_put_down_to_the_tendon(
     tmp_path: Path, geom: str, is_told: bool
@@ -911,17 +919,25 @@ def test_energy_of_a_tendon_that_jumps_is_put_down_to_the_tendon(
         assert (fault.place.element, "damping" in fault.change) == ("tendon 'cord'", False)
 
 
-ARM_WITH_SENSORS = """<body name="arm"><joint type="slide" axis="0 0 1"/><site name="wrist"/>
+ARM_WITH_SENSORS = """<body name="arm"><joint name="lift" type="slide" axis="0 0 1"/>
+  <site name="wrist"/>
   <geom size="0.01" mass="0.05" {off}/><body name="hand" pos="0 0 -.1"><site name="grip"/>
     <geom size="0.01" mass="0.02" {off}/></body>
-  <body name="finger" pos=".1 0 0"><joint axis="0 1 0" damping="1"/><site name="pad"/>
+  <body name="finger" pos=".1 0 0"><joint name="bend" axis="0 1 0" damping="1"/><site name="pad"/>
     <geom size="0.01" mass="0.02" {off}/></body></body>"""
 
 
 def test_sensor_that_carries_the_grip_is_told_to_read_the_coupling(tmp_path: Path) -> None:
     sensors = """<sensor><force name="at wrist" site="wrist"/><torque name="too" site="wrist"/>
-      <force name="at pad" site="pad"/><framepos objtype="site" objname="wrist"/></sensor>"""
+      <force name="at pad" site="pad"/><framepos objtype="site" objname="wrist"/>
+      <jointactuatorfrc name="of lift" joint="lift"/>
+      <jointactuatorfrc name="of finger" joint="bend"/></sensor>"""
     body = ARM_WITH_SENSORS.format(off='contype="0" conaffinity="0"')
     text = mjcf(GOOD_OPTION, GOOD_CONTACT, sensors, body=body)
     told = [fault for fault in faults_in(tmp_path, text) if fault.kind == "force sensor"]
-    assert [fault.place.element for fault in told] == ["force 'at wrist'", "torque 'too'"]
+    assert [fault.place.element for fault in told] == [
+        "force 'at wrist'",
+        "torque 'too'",
+        "jointactuatorfrc 'of lift'",
+    ]
+    assert "'of lift' is of a joint that moves the grip" in told[2].sentence

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import pkgutil
+import re
 import signal
 import threading
 import time
@@ -172,6 +173,31 @@ def test_carrying_the_tool_is_advised_with_what_it_leaves_and_only_where_it_is_n
     assert (advice in words, cause in words) == (not is_carried, not is_carried)
     assert "this tool weighs" not in words
     assert ("from what hangs or lies on the tool, whose weight is carried" in words) == is_carried
+
+
+HAMMER = """<mujoco><option timestep="0.001"/><worldbody><body pos="0 0 0.2"><freejoint/>
+<geom type="box" pos="0.3 0 0" size="0.015 0.015 0.04" mass="{}"/><site name="grip"/></body>
+</worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(("mass", "is_told"), [(0.03, False), (0.1, True)])
+def test_a_head_held_off_its_centre_is_told_by_its_torque(
+    call: Called, tmp_path: Path, mass: float, *, is_told: bool
+) -> None:
+    """m g l is 0.0883 and 0.294 N m, the limit 0.5 N m, K_r 2.4 N m/rad."""
+    scene = tmp_path / "hammer.xml"
+    scene.write_text(HAMMER.format(mass))
+    _, _, err = call("run", scene, "--fast", "--duration", 0.05)
+    found = re.search(
+        r"this tool turns the hand with (\d+) mN m, which holds it ([\d.]+) deg beside the handle; "
+        r"--no-tool-weight carries the tool alone \(tried: the hand then bears 0 N m\)",
+        " ".join(err.split()),
+    )
+    assert bool(found) == is_told
+    if found:
+        torque, degrees = map(float, found.groups())
+        assert 1e-3 * torque == pytest.approx(mass * 9.81 * 0.3, rel=0.02)
+        assert degrees == pytest.approx(math.degrees(mass * 9.81 * 0.3 / 2.4), rel=0.02)
 
 
 DRIVEN = """<mujoco><option timestep="0.001"/><worldbody><body name="sledge">

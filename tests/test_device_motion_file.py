@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import zstandard
 from audit_cases import recorded
+from cli_cases import Called
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -205,22 +206,33 @@ def test_a_bag_without_an_index_or_topics_in_it_is_read(
 
 
 @pytest.mark.parametrize(
-    ("name", "words"),
+    ("name", "begin", "words"),
     [
-        ("bag_0.db3", "in SQLite"),
-        ("hand.bag", "'rosbags-convert --dst-storage mcap'"),
-        ("bag_0.mcap.zstd", "what 'zstd -d' makes of it is read"),
-        ("hand.csv.gz", "what 'gunzip' makes of it is read"),
+        ("bag_0.db3", b"SQLite format 3\0", "in SQLite; 'ros2 bag convert' writes it in MCAP"),
+        ("hand.bag", b"#ROSBAG V2.0\n", "'rosbags-convert --dst-storage mcap'"),
+        ("bag_0.mcap.zstd", b"\x28\xb5\x2f\xfd", "what 'zstd -d' makes of it is read"),
+        ("hand.csv.gz", b"\x1f\x8b", "what 'gunzip' makes of it is read"),
     ],
 )
 def test_a_bag_of_another_kind_is_told_with_what_reads_it(
-    name: str, words: str, tmp_path: Path
+    name: str, begin: bytes, words: str, tmp_path: Path, call: Called
 ) -> None:
     path = tmp_path / name
-    path.write_bytes(b"\x28\xb5\x2f\xfd")
+    path.write_bytes(begin)
     for place in (path, path.parent):
         with pytest.raises(DeviceError, match=words):
             open_device(f"trajectory:{place}")
+    for place in (path, path.parent):
+        code, _, told = call("audit", place)
+        assert (code, words in told) == (2, True)
+    renamed = tmp_path / "run.mcap"
+    path.rename(renamed)
+    for asked in (("audit",), ("export", "--format", "csv"), ("view",)):
+        code, _, told = call(*asked, renamed)
+        assert (code, words in told) == (2, True)
+    assert ("only what 'hapticbridge run' wrote is a recording" in told) == (
+        "a bag of" in words + told
+    )
 
 
 def test_a_bag_that_compresses_each_message_is_told(tmp_path: Path) -> None:

@@ -109,3 +109,35 @@ def test_lerobot_has_the_sensors_by_name(run: Path, tmp_path: Path) -> None:
     state = np.array(read["observation.state"].to_pylist())
     np.testing.assert_allclose(sensed[:, :3], state[:, :3], atol=1e-3)
     assert '"coarse, =_"' in (folder / "meta" / "info.json").read_text()
+
+
+LIFTED = """<mujoco model="lifted"><option timestep="0.001"/><worldbody>
+<body><joint name="lift" type="slide" axis="0 0 1"/><geom size=".02" mass="0.1"/>
+<site name="wrist"/><body name="hand"><geom size=".01" mass="0.1" contype="0" conaffinity="0"/>
+<site name="grip"/></body></body></worldbody>
+<sensor><jointpos name="height" joint="lift"/><force name="at wrist" site="wrist"/>
+<jointactuatorfrc name="motor" joint="lift"/></sensor></mujoco>"""
+"""A tool of 0.2 kg in the hand, without any motor."""
+
+COUPLED = ["at wrist_0", "at wrist_1", "at wrist_2", "motor"]
+
+
+def test_readings_that_include_the_coupling_are_told(tmp_path: Path, call: Called) -> None:
+    (tmp_path / "lifted.xml").write_text(LIFTED)
+    file, table = tmp_path / "run.mcap", tmp_path / "run.csv"
+    with hb.Bridge(tmp_path / "lifted.xml", clock=hb.SimulatedClock(), recording=file) as bridge:
+        bridge.run(duration=0.2)
+    asked = ("--format", "csv", "--sensors", "--out", table)
+    _, _, told = call("export", file, *asked)
+    words = " ".join(told.split())
+    columns = ", ".join(f"'sensor_{name}'" for name in COUPLED)
+    assert f"{columns}: these readings include the coupling's pull on the tool" in words
+    # the weight of 2 N, which no real sensor would read here; the actuators give half of it
+    assert read_table(table, "sensor_at wrist_2")[1] == pytest.approx(0.2 * 9.81, rel=0.02)
+    assert read_table(table, "sensor_motor")[1] == pytest.approx(0.1 * 9.81, rel=0.02)
+    done = write_dataset([file], "robomimic", tmp_path / "set")
+    assert list(done.coupled) == COUPLED
+    _, _, told = call("export", file, "--format", "lerobot", "--out", tmp_path / "other")
+    assert "'motor': these readings include the coupling's pull" in " ".join(told.split())
+    _, _, told = call("export", file, "--format", "csv", "--out", tmp_path / "plain.csv")
+    assert "readings" not in told

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import SeekingReader, make_reader
-from mcap.writer import Writer
+from mcap.writer import IndexType, Writer
 from mcap_ros2.decoder import DecoderFactory
 from recording_cases import EPOCH, META, random_rows, write
 from rosbags.highlevel import AnyReader
@@ -202,14 +202,35 @@ def test_a_schema_that_names_other_numbers_is_found(
     assert audit(forged).verdict != "passive"
 
 
-def written_anew(path: Path, output: Path, *, is_forged: bool, step: int = 1) -> None:
+WITHOUT_SUMMARY: dict[str, Any] = {
+    "index_types": IndexType.NONE,
+    "repeat_channels": False,
+    "repeat_schemas": False,
+    "use_statistics": False,
+    "use_summary_offsets": False,
+}
+
+
+def written_anew(
+    path: Path,
+    output: Path,
+    *,
+    is_forged: bool = False,
+    step: int = 1,
+    first: tuple[str, ...] = (),
+    **options: Any,
+) -> None:
     """Writes a recording with the library: topic after topic, and the metadata at the end."""
     with path.open("rb") as source, output.open("wb") as target:
-        reader, writer = SeekingReader(source), Writer(target)
+        reader, writer = SeekingReader(source), Writer(target, **options)
         writer.start(profile="ros2")
         ids: dict[str, int] = {}
+
+        def place(message: Any) -> tuple[bool, str]:
+            return message[1].topic not in first, message[1].topic
+
         messages = list(reader.iter_messages(log_time_order=False))
-        for schema, channel, message in sorted(messages, key=lambda m: m[1].topic)[::step]:
+        for schema, channel, message in sorted(messages, key=place)[::step]:
             assert schema is not None
             if channel.topic not in ids:
                 known = writer.register_schema(schema.name, schema.encoding, schema.data)
@@ -240,3 +261,40 @@ def test_order_of_topics_and_metadata_is_no_damage_but_what_they_say_and_ticks_b
     assert read_recording(path).problems == (
         "its ticks are not in order: tick 1499 is followed by tick 1498",
     )
+
+
+@pytest.mark.parametrize("topics", [("/tick",), ("/event",), ("/tick", "/event"), ("/rosout",)])
+def test_a_file_without_summary_may_name_the_topics_of_ros_after_the_ticks(
+    run: Path, tmp_path: Path, topics: tuple[str, ...]
+) -> None:
+    path = tmp_path / "anew.mcap"
+    written_anew(run, path, first=topics, **WITHOUT_SUMMARY)
+    recording = read_recording(path)
+    assert recording.problems == ()
+    assert recording.ticks.tobytes() == read_recording(run).ticks.tobytes()
+    assert audit(path).verdict == "passive"
+    written_anew(run, path, is_forged=True, first=topics, **WITHOUT_SUMMARY)
+    (problem,) = read_recording(path).problems
+    assert problem == "what '/tf' say does not follow from the ticks and events"
+
+
+def test_stamps_keep_their_last_second_in_2038_and_log_times_go_on(tmp_path: Path) -> None:
+    """The seconds of a stamp are a signed number of 32 bits, whose last is 2^31 - 1."""
+    path, begin = tmp_path / "late.mcap", 2**31 * 10**9 - 100_000_000
+    writer = RecordingWriter(path, META, (), begin)
+    writer.write_event({"event": "start"}, 0)
+    writer.write_ticks(random_rows(300))
+    writer.write_event({"event": "mark"}, 300_000_000)
+    writer.close()
+    found = decoded(path)
+    last = (2**31 - 1, 999_999_999)
+    for topic in ("/tool_pose", "/rosout"):
+        stamps = [
+            (stamp.sec, stamp.nanosec)
+            for _, value in found[topic]
+            for stamp in [value.stamp if topic == "/rosout" else value.header.stamp]
+        ]
+        times = [time for time, _ in found[topic]]
+        assert max(times) > 2**31 * 10**9
+        assert stamps == [min(divmod(time, 10**9), last) for time in times]
+    assert read_recording(path).problems == ()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import io
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,9 @@ import pytest
 import report_runs
 from audit_cases import ScriptedDevice, recorded
 from bridge_runs import still
+from check_scenes import GOOD_OPTION, LEAPING
 from chromium import browser
+from outside_scenes import mjcf
 from PIL import Image
 from report_runs import Made
 
@@ -334,6 +337,25 @@ def test_a_joint_that_pumps_is_named_as_the_cause(tmp_path: Path) -> None:
     cause = cause_of(read_recording(path), audit(path))
     assert cause.kind == "pump"
     assert "joint 'rail' has a damping of -30" in cause.evidence
+
+
+def test_a_tendon_whose_length_jumps_is_named_as_the_cause(tmp_path: Path) -> None:
+    path, scene = tmp_path / "run.mcap", tmp_path / "cord.xml"
+    way = '<site site="a"/><geom geom="brim"/><site site="b"/>'
+    cord = f'<tendon><spatial name="cord" stiffness="100">{way}</spatial></tendon>'
+    scene.write_text(mjcf(GOOD_OPTION, cord, body=LEAPING))
+    lengths = []
+    with Bridge(str(scene), clock=SimulatedClock(), recording=path) as bridge:
+        bridge.run(
+            duration=1.2, on_tick=lambda _: lengths.append(float(bridge.scene.data.ten_length[0]))
+        )
+    cause = cause_of(read_recording(path), audit(path))
+    assert cause.kind == "jumping tendon"
+    assert "sidesite" in cause.remedy
+    told = re.search(r"tendon 'cord' jumped, by up to ([\d.]+) mm", cause.evidence)
+    assert told
+    # but for what its speed of 0.1 m/s explains
+    assert float(told[1]) == pytest.approx(1e3 * np.abs(np.diff(lengths)).max(), abs=0.2)
 
 
 def test_missed_deadlines_are_the_cause_where_the_device_bears_the_coupling(made: Made) -> None:

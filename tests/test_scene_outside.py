@@ -19,7 +19,7 @@ from outside_scenes import hand_file, scene_file
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
-from hapticbridge.scene.rehearsal import holding_force, loaded_handle, static_load
+from hapticbridge.scene.rehearsal import holding_wrench, loaded_handle, static_load
 from hapticbridge.scene.start import Start
 
 Array = NDArray[np.float64]
@@ -278,6 +278,51 @@ def test_tool_that_the_device_cannot_hold_is_carried(
     assert run.meta["tool_weight"] == ("carried" if is_carried else "felt")
 
 
+HAMMER = """<mujoco><option timestep="0.001"/><worldbody><body pos="0 0 0.2"><freejoint/>
+<geom type="box" pos="0.3 0 0" size="0.015 0.015 0.04" mass="{}"/><site name="grip"/></body>
+</worldbody></mujoco>"""
+"""A head 0.3 m from the grip at the end of its handle, which weighs nothing."""
+
+
+@pytest.mark.parametrize(
+    ("mass", "dof", "is_carried"),
+    [
+        (0.12, 6, False),  # m g l is 0.35 N m
+        (0.2, 6, True),  # 0.59 N m, but 2 N
+        (0.2, 3, False),  # the head sinks until it hangs, as from any device that cannot turn
+    ],
+)
+def test_tool_whose_torque_the_device_cannot_hold_is_carried(
+    tmp_path: Path, mass: float, dof: int, *, is_carried: bool
+) -> None:
+    """The simulated device holds 10 N and 0.5 N m."""
+    torque = mass * WEIGHT * 0.3
+    with started(tmp_path, HAMMER.format(mass), device=f"simulated:dof={dof}") as bridge:
+        scene, parameters = bridge.scene, bridge.session.parameters
+        assert scene.is_carried == is_carried
+        if torque < 0.5:  # nothing swings where the coupling carries it from the start
+            force, held = holding_wrench(scene, parameters)
+            assert (force, held) == pytest.approx((mass * WEIGHT, torque), rel=0.02)
+        bridge.run(duration=1.0)
+    if is_carried:
+        words = r"within 1 s it turns with up to (\d+) mN m, and the device holds 500 mN m\)"
+        found = re.search(words, scene.changes[-1])
+        assert found
+        assert torque < 1e-3 * float(found[1]) < 2.0 * torque  # it falls from rest
+    report = hb.audit(tmp_path / "run.mcap")
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+def test_motor_that_turns_the_tool_is_not_taken_for_its_weight(tmp_path: Path) -> None:
+    text = """<mujoco><option timestep="0.001"/><worldbody><body><joint name="j" axis="0 0 1"/>
+    <geom size="0.02" mass="0.1"/><site name="grip"/></body></worldbody>
+    <actuator><motor joint="j"/></actuator>
+    <keyframe><key name="home" ctrl="0.6"/></keyframe></mujoco>"""
+    with started(tmp_path, text) as bridge:
+        assert holding_wrench(bridge.scene, bridge.session.parameters)[1] > 0.5
+        assert not bridge.scene.is_carried
+
+
 def test_weight_is_carried_on_request_and_not_as_is(tmp_path: Path) -> None:
     with started(tmp_path, outside.mjcf(), tool_weight=False) as bridge:
         bridge.run(duration=0.1)
@@ -370,7 +415,8 @@ FLOPPY = """<mujoco>
 
 
 def test_handle_starts_at_grip_of_a_robot_that_falls_beside_it(tmp_path: Path) -> None:
-    with started(tmp_path, FLOPPY, device="simulated:force_limit=1000") as bridge:
+    device = "simulated:force_limit=1000,torque_limit=1000"
+    with started(tmp_path, FLOPPY, device=device) as bridge:
         parameters = bridge.session.parameters
         assert parameters.handle_origin == bridge.scene.grip_pose()
         load = static_load(bridge.scene, parameters)
@@ -522,9 +568,9 @@ def test_the_force_of_a_servo_is_not_taken_for_the_weight_of_the_tool(tmp_path: 
     with started(tmp_path, SERVO, device="simulated:force_limit=1000") as bridge:
         scene, parameters = bridge.scene, bridge.session.parameters
         limits = scene.model.actuator_forcelimited.copy()
-        weight = holding_force(scene, parameters, has_motors=False)
+        weight = holding_wrench(scene, parameters, has_motors=False)[0]
         assert 1.0 < weight / (0.11 * 9.81) < 2.0  # the first swing included, damped
-        assert holding_force(scene, parameters) > 10.0
+        assert holding_wrench(scene, parameters)[0] > 10.0
         assert np.array_equal(scene.model.actuator_forcelimited, limits)
 
 

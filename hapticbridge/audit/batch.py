@@ -16,6 +16,7 @@ from hapticbridge.audit import audit
 from hapticbridge.confinement import ForeignSceneError
 from hapticbridge.errors import RecordingError, StudyError, choices
 from hapticbridge.files import check_target, finite_or_null, name_fault, reason_of
+from hapticbridge.recording.reader import foreign_file
 from hapticbridge.sweep import Interrupted, Table, Value, Workers, check_format, sweep
 
 FEW = 8
@@ -240,7 +241,9 @@ def find_recordings(words: Iterable[str | Path]) -> list[Path]:
         if path.is_dir():
             files = _below(path)
             if not files:
-                raise RecordingError(f"there is no recording (*{ENDING}) in the folder '{path}'")
+                raise RecordingError(
+                    f"there is no recording (*{ENDING}) in the folder '{path}'{_bag_in(path)}"
+                )
         elif glob.has_magic(str(path)) and not path.exists():
             files = _fitting(path)
             if not files:
@@ -251,6 +254,16 @@ def find_recordings(words: Iterable[str | Path]) -> list[Path]:
             except RuntimeError:  # a link to itself, of which reading says more
                 found.setdefault(file.absolute(), file)
     return list(found.values())
+
+
+def _bag_in(folder: Path) -> str:
+    """Returns a clause on a bag that is not read in a folder without recordings, or nothing."""
+    try:
+        files = sorted(folder.iterdir())
+    except OSError:  # which the message before it tells
+        return ""
+    kinds = ((file.name, foreign_file(file)) for file in files)
+    return next((f": '{name}' is {kind}" for name, kind in kinds if kind), "")
 
 
 def _below(folder: Path) -> list[Path]:

@@ -31,6 +31,7 @@ from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.recording import RecordingFile
 from hapticbridge.run.commands import bits_in, concerns, coupling_in, pose_in, tuning_ticks
 from hapticbridge.run.description import STARTS, meta_start, method_of, parameters_of
+from hapticbridge.units import format_count
 
 Array = NDArray[np.float64]
 
@@ -144,7 +145,8 @@ class RunEvents:
         if last.rotational_stiffness == first.rotational_stiffness:
             rotation = []
         return (
-            f"so it began; commands changed the coupling {len(self.couplings) - 1} times, last to "
+            f"so it began; commands changed the coupling "
+            f"{format_count(len(self.couplings) - 1, 'time')}, last to "
             f"{'; '.join([translation, *rotation])}",
         )
 

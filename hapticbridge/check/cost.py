@@ -30,7 +30,7 @@ from hapticbridge.recording import TAIL, Ring
 from hapticbridge.recording.recorder import NOBODY_READS
 from hapticbridge.scene import Scene
 from hapticbridge.scene.fault import Fault
-from hapticbridge.units import format_si
+from hapticbridge.units import format_number, format_si
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -175,7 +175,7 @@ class Cost:
         p99, left = self.all_ticks.p99, TICK_SHARE * case.period
         lower = f"and run with --rate {highest}; or " if highest >= LOWEST_RATE else ""
         ticks = math.ceil(self.all_ticks.p99 / (TICK_SHARE * case.period))
-        beside = f"{rate / min(max(ticks, 2), MAX_SCENE_TICKS):.3g}"
+        beside = format_number(rate / min(max(ticks, 2), MAX_SCENE_TICKS), 3)
         return Fault(
             "rate",
             case.places.option("timestep"),

@@ -20,10 +20,9 @@ from hapticbridge.check.geometry_faults import grip_faults, mesh_faults, workspa
 from hapticbridge.check.mass_faults import mass_faults
 from hapticbridge.check.run_faults import run_faults
 from hapticbridge.errors import choices
-from hapticbridge.kernel.codes import held_body
 from hapticbridge.run.fidelity import fidelity
 from hapticbridge.scene import compile_scene
-from hapticbridge.scene.checks import MAY_BE_ACTIVE, first_pump, unmetered_work
+from hapticbridge.scene.checks import MAY_BE_ACTIVE, coupled_sensors, first_pump, unmetered_work
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.fault import Fault
 from hapticbridge.scene.first_faults import (
@@ -34,6 +33,7 @@ from hapticbridge.scene.first_faults import (
     unit_faults,
 )
 from hapticbridge.scene.treatment import Treatment
+from hapticbridge.units import format_count
 
 # Faults of options, start, and motion without a hand
 
@@ -123,32 +123,31 @@ def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:
 
 
 def sensor_faults(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Yields force and torque sensors between the grip and the world.
-
-    MuJoCo computes them from motion, weight, contacts and equalities. It counts actuators, of which
-    the coupling is made, as motors of the joints, whose pull passes the sensor.
-    """
-    model, body = case.model, held_body(case.model, case.scene.grip)
-    carriers = {body}
-    while body:
-        body = int(model.body_parentid[body])
-        carriers.add(body)
-    for sensor in range(model.nsensor):
-        is_force = int(model.sensor_type[sensor]) in (
-            int(mujoco.mjtSensor.mjSENS_FORCE),
-            int(mujoco.mjtSensor.mjSENS_TORQUE),
-        )
-        if not is_force or int(model.site_bodyid[model.sensor_objid[sensor]]) not in carriers:
-            continue
-        name = str(model.sensor(sensor).name)
-        tag = "force" if model.sensor_type[sensor] == mujoco.mjtSensor.mjSENS_FORCE else "torque"
+    """Yields sensors that read the coupling's pull (``coupled_sensors``)."""
+    model = case.model
+    for sensor in coupled_sensors(model, case.scene.grip):
+        name, tag = str(model.sensor(sensor).name), _FORCE_SENSORS[int(model.sensor_type[sensor])]
+        place, pull = "carries the grip", "the coupling's pull on the tool"
+        mend = "nothing; subtract the wrench on the tool, about its site and along its axes"
+        if tag == "jointactuatorfrc":
+            place = "is of a joint that moves the grip"
+            pull += ", half of it or, near contact, all"
+            mend = '<actuatorfrc actuator="…"/> for each of the joint\'s own actuators instead'
         yield Fault(
             "force sensor",
             case.places.named(tag, name),
-            f"sensor '{name or sensor}' carries the grip: its readings include the coupling's pull "
-            "on the tool, which MuJoCo takes for a motor's, and a real sensor there would not",
-            "nothing; subtract the wrench on the tool, about its site and along its axes",
+            f"sensor '{name or sensor}' {place}: its readings include {pull}, which MuJoCo takes "
+            "for a motor's, and a real sensor there would not",
+            mend,
         )
+
+
+_FORCE_SENSORS = {
+    int(mujoco.mjtSensor.mjSENS_FORCE): "force",
+    int(mujoco.mjtSensor.mjSENS_TORQUE): "torque",
+    int(mujoco.mjtSensor.mjSENS_JOINTACTFRC): "jointactuatorfrc",
+}
+"""Elements of the sensors that may read the coupling's pull."""
 
 
 # Rules by which a scene is judged
@@ -185,5 +184,7 @@ def find_faults(case: SceneUnderCheck) -> tuple[Fault, ...]:
     units = [fault for fault in faults if fault.kind == UNITS]
     if not units or len(faults) == len(units):
         return tuple(faults)
-    waiting = f"; {len(faults) - len(units)} more findings wait until this is mended"
+    more = len(faults) - len(units)
+    verb = "waits" if more == 1 else "wait"
+    waiting = f"; {format_count(more, 'more finding')} {verb} until this is mended"
     return tuple(replace(fault, sentence=fault.sentence + waiting) for fault in units)

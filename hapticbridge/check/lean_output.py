@@ -18,6 +18,7 @@ from hapticbridge.files import check_target, reason_of
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.scene import SceneSource, read_scene
 from hapticbridge.scene.handle import set_step
+from hapticbridge.units import format_number
 
 
 def trial_facts(trial: VariantVerdict) -> dict[str, str | float | int | None]:
@@ -170,8 +171,8 @@ def _comment(lean: Lean, before: str) -> str:
         "",
         f"  Made leaner from {source.path.name} by 'hapticbridge check': in a motion of "
         f"{judge.motion.duration:g} s it costs {result.percent:.0f} % of that scene,",
-        f"  and differs by {result.jnd:.2g} just noticeable differences "
-        f"(allowed: {judge.budget:g}).",
+        f"  and differs by {format_number(result.jnd, 2)} just noticeable differences (allowed: "
+        f"{judge.budget:g}).",
         *(f"  Taken: {trial.name} ({trial.sentence})." for trial in lean.together),
     ]
     if any(trial.loses == OTHER_MOTIONS for trial in lean.together):
@@ -179,7 +180,7 @@ def _comment(lean: Lean, before: str) -> str:
     if setting != lean.judge.original.setting:
         lines.append(
             f"  To be run at {1 / setting.period:g} Hz with {setting.substeps} substep(s) a tick; "
-            f"the device then needs {result.needed_damping:.3g} N s/m of damping."
+            f"the device then needs {format_number(result.needed_damping, 3)} N s/m of damping."
         )
     text = "\n".join([*lines, "  "]).replace("--", "- -")
     return f"{before.rstrip()}\n{text}" if before.strip() else text

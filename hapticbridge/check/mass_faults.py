@@ -14,7 +14,8 @@ from hapticbridge.kernel.codes import held_body
 from hapticbridge.scene.fault import Fault, length, number, others, weight
 from hapticbridge.scene.handle import tied_trees
 from hapticbridge.scene.physics import body_inertia
-from hapticbridge.scene.rehearsal import stiffness_without_hand
+from hapticbridge.scene.rehearsal import stiffness_without_hand, wrench_sizes
+from hapticbridge.units import format_degrees, format_number
 
 WATER = 1000.0
 """Default density of a MuJoCo geom in kg/m³."""
@@ -25,8 +26,9 @@ MAX_RATIO = 1000.0
 the stiffness of the lighter body, so the heavier one penetrates a thousand times as deep."""
 
 
-MAX_SAG = 1e-3
-"""Largest stretch in m of the coupling under the tool's weight at rest."""
+MAX_SAG, MAX_DROOP = 1e-3, 0.05
+"""Largest stretch in m and turn in rad of the coupling under the tool's weight at rest. With the
+usual coupling they are a quarter of the usual force and torque limits, 2.4 N and 0.12 N m."""
 
 
 def mass_faults(case: SceneUnderCheck) -> Iterator[Fault]:
@@ -145,12 +147,12 @@ def _load_ratios(case: SceneUnderCheck) -> Iterator[Fault]:
                 place,
                 f"{place.element} ({weight(own)}) carries {name} ({weight(load)}), "
                 f"1 to {number(load / own)}: its motion is computed from small differences",
-                f'mass="{load / MAX_RATIO:.3g}" or more in it',
+                f'mass="{format_number(load / MAX_RATIO, 3)}" or more in it',
             )
 
 
 def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Computes the tool's sag below the handle: (JᵀKJ + K_springs + K_servos) δq = the weight.
+    """Computes sag and droop below the handle: (JᵀKJ + K_springs + K_servos) δq = the weight.
 
     Bodies of other trees that active welds and connects tie to the tool hang on it: A δq = 0 with
     the Jacobian A of these equalities.
@@ -175,23 +177,34 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     stiffness += stiffness_without_hand(model, data, dofs, has_weight=False)
     free = _unconstrained(model, data, dofs) if tied else np.eye(dofs.size)
     moved = free @ np.linalg.lstsq(free.T @ stiffness @ free, free.T @ pulls, rcond=1e-9)[0]
-    sag = float(np.linalg.norm(tool_jacobian[:3] @ moved))
-    if sag <= MAX_SAG:
+    sag, droop = wrench_sizes(tool_jacobian @ moved)
+    parts = []
+    if sag > MAX_SAG:
+        parts.append(
+            f"{number(sag * coupling.stiffness)} N, which stretches the coupling of "
+            f"{format_number(coupling.stiffness)} N/m by {length(sag)}"
+        )
+    if droop > MAX_DROOP:
+        parts.append(
+            f"{number(droop * coupling.rotational_stiffness)} N m about the grip, which turns the "
+            f"coupling of {format_number(coupling.rotational_stiffness)} N m/rad by "
+            f"{format_degrees(droop, 2)}"
+        )
+    if not parts:
         return
     of_tool = np.flatnonzero(case.tool_bodies)
     mass = float(model.body_mass[bodies].sum())
     what, where = "the tool", "the body and those below it"
     if tied:
         what, where = "the tool, with what is tied to it,", f"{where}, and in those tied to it"
-    pull = sag * coupling.stiffness
     yield Fault(
         "heavy tool",
         case.places.body(int(of_tool[0])),  # the first that moves
-        f"{what} weighs {weight(mass)}; the hand carries {number(pull)} N of it where no contact, "
-        f"limit or dry friction does, and this stretches the coupling of {coupling.stiffness:.4g} "
-        f"N/m by {length(sag)} at rest; a run carries it where the device cannot, and with "
-        "--no-tool-weight",
-        f'gravcomp="1" in {where}, or less mass',
+        f"{what} weighs {weight(mass)}; where no contact, limit or dry friction carries it, the "
+        f"hand carries {' and '.join(parts)} at rest; a run carries it where the device cannot, "
+        "and with --no-tool-weight",
+        f'gravcomp="1" in {where}, or less mass'
+        + (", or a grip nearer to the centre of mass" if droop > MAX_DROOP else ""),
     )
 
 

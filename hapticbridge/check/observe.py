@@ -22,6 +22,7 @@ from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
 from hapticbridge.run.summary import Ledger
 from hapticbridge.scene import Scene
+from hapticbridge.scene.physics import Lengths
 
 # Clearance of the tool between opposite walls
 
@@ -253,11 +254,6 @@ MAX_WORK, MIN_TICKS = 2e6, 500
 and the ticks that it always takes. A unit costs 3 to 7 µs. A scene of 400 is observed for 5 s, a
 heavier one for less."""
 
-JUMP = 1e-4
-"""Change in m of a tendon's length in a tick, beyond that of its speed, from which on it counts as
-a jump. A tendon that leaves a geom which it wraps jumps by mm; a smaller value would tell rounding
-of a blow's tick."""
-
 PROGRESS_EVERY = 500
 """Ticks between two calls of ``progress``."""
 
@@ -336,7 +332,7 @@ def observe(
     types = np.zeros((samples.size, len(_TYPE.__members__)), np.int64)
     postures, every = [], max(samples.size // POSTURES, 1)
     force, full, work, done = np.zeros(samples.size), 0, 0, samples.size
-    jumps, tendons = dict[int, float](), (data.ten_length.copy(), data.ten_velocity.copy())
+    jumps, tendons = dict[int, float](), Lengths.of(data)
     for k in range(samples.size):
         if work > MAX_WORK and k >= MIN_TICKS:
             done = k
@@ -353,9 +349,9 @@ def observe(
         if data.ncon:
             _note_contacts(data, model.opt.timestep, meetings, setting.contact == RIGID)
         if model.ntendon:
-            now = data.ten_length.copy(), data.ten_velocity.copy()
-            if k:
-                _note_jumps(tendons, now, period, jumps)
+            now = Lengths.of(data)
+            for tendon, size in now.jumps_since(tendons, period).items() if k else ():
+                jumps[tendon] = max(jumps.get(tendon, 0.0), size)
             tendons = now
         iterations = data.solver_niter[: max(data.nisland, 1)]
         full += bool(data.nefc) and bool(iterations.max(initial=0) >= model.opt.iterations)
@@ -377,21 +373,6 @@ def observe(
         slack_share=ledger.slack_share,
         jumps=jumps,
     )
-
-
-_Tendons = tuple[NDArray[np.float64], NDArray[np.float64]]
-
-
-def _note_jumps(before: _Tendons, now: _Tendons, period: float, jumps: dict[int, float]) -> None:
-    """Adds the tendons whose length changed by more than their speed, before or now, accounts for.
-
-    A length L of a smooth path changes by |ΔL| <= T max |L̇| in a period T. The factor of two leaves
-    room for speeds within the steps of a tick.
-    """
-    speed = np.maximum(np.abs(before[1]), np.abs(now[1]))
-    beyond = np.abs(now[0] - before[0]) - 2.0 * period * speed
-    for tendon in np.flatnonzero(beyond > JUMP).tolist():
-        jumps[tendon] = max(jumps.get(tendon, 0.0), float(beyond[tendon]))
 
 
 def _note_contacts(

@@ -12,6 +12,8 @@ from hapticbridge.check.observe import Observation
 from hapticbridge.scene.checks import unmetered_work
 from hapticbridge.scene.contacts import suggested_solref
 from hapticbridge.scene.fault import Fault, length, number
+from hapticbridge.scene.physics import STEADY_WAY
+from hapticbridge.units import format_count
 
 ITERATIONS = 100
 """MuJoCo's default limit of solver iterations. Newton's solver takes 1 to 8 in the shipped
@@ -54,7 +56,7 @@ def run_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         yield Fault(
             "MuJoCo warning",
             option("timestep"),
-            f"MuJoCo warned {count} times in the motion: {words}",
+            f"MuJoCo warned {format_count(count, 'time')} in the motion: {words}",
             "follow the warning's advice",
         )
     yield from _falling_bodies(case, seen)
@@ -128,7 +130,7 @@ def _created_by_jump(case: SceneUnderCheck, seen: Observation, kind: str, used: 
         place,
         f"{place.element} jumped by {length(seen.jumps[tendon])} in one tick of the motion, as its "
         f"way round a geom changed, and energy was created: {used}",
-        'a sidesite="…" at the geom that it wraps, or a geom that it never leaves or never meets',
+        STEADY_WAY,
     )
 
 

@@ -51,7 +51,7 @@ from hapticbridge.run.hands import Grasp
 from hapticbridge.run.options import BridgeOptions, Workspace
 from hapticbridge.scene import plain_model, read_scene, settings_from
 from hapticbridge.scene.fault import Fault, length, others, weight
-from hapticbridge.units import format_si
+from hapticbridge.units import format_number, format_si
 
 _HEADINGS = ("alone", "cost", "JND", "tool force, RMS", "peak", "tool torque, RMS", "tool off by")
 """Headings of the table of trials. JND is the felt error in just noticeable differences."""
@@ -65,7 +65,7 @@ def print_lean(lean: Lean) -> None:
     tick = 1e6 * judge.seconds * judge.original.setting.period
     out.print(
         f"\n[bold]What could go[/] (felt up to {judge.budget:g} just noticeable differences; "
-        f"the scene as it is: {tick:.3g} µs a tick)"
+        f"the scene as it is: {format_number(tick, 3)} µs a tick)"
     )
     rows = [_numbers(trial) for trial in (*lean.alone, *lean.together)]
     ends = [_verdict(trial) for trial in lean.alone] + [plain(t.loses) for t in lean.together]
@@ -90,18 +90,20 @@ def print_lean(lean: Lean) -> None:
     setting = lean.draft.setting
     if setting != judge.original.setting:
         out.print(
-            f"  at {1 / setting.period:.4g} Hz, {setting.substeps} substep(s) a tick: the device "
-            f"needs {lean.result.needed_damping:.3g} N s/m of damping"
+            f"  at {format_number(1 / setting.period)} Hz, {setting.substeps} substep(s) a tick: "
+            f"the device needs {format_number(lean.result.needed_damping, 3)} N s/m of damping"
         )
     cost = lean.result.percent
-    out.print(f"  all together: {cost:.0f} % of the cost, {100 / cost:.2g} times as fast")
+    out.print(
+        f"  all together: {cost:.0f} % of the cost, {format_number(100 / cost, 2)} times as fast"
+    )
 
 
 def print_written(lean: Lean, written: VariantVerdict, path: Path, *, is_quiet: bool) -> None:
     """Prints what the written scene is like, read back, and how to run it."""
     err.print(
         f"wrote {plain(str(path))}: read back, {written.percent:.0f} % of the cost, felt "
-        f"{written.jnd:.2g} JND"
+        f"{format_number(written.jnd, 2)} JND"
     )
     if is_quiet:
         return
@@ -151,12 +153,12 @@ _WIDTH = 96  # letters of a line of text below a fault
 def print_case(case: SceneUnderCheck) -> None:
     """Prints what is checked, and how."""
     extent = 1e3 * np.ptp(case.motion.table[:, 1:4], axis=0)
-    size = " x ".join(f"{edge:.3g}" for edge in extent)
+    size = " x ".join(format_number(edge, 3) for edge in extent)
     sentence, *_ = RunCoupling.of(default_method(), case.period, case.coupling).sentences()
     out.print(f"[bold]{plain(case.scene.name)}[/]  {plain(str(case.source.path))}")
     out.print(
-        f"  motion: {plain(case.motion_name)}, {case.motion.duration:.3g} s, {size} mm; "
-        f"coupling: {sentence}, {1 / case.period:.4g} Hz, {case.contact} contacts"
+        f"  motion: {plain(case.motion_name)}, {format_number(case.motion.duration, 3)} s, {size} "
+        f"mm; coupling: {sentence}, {format_number(1 / case.period)} Hz, {case.contact} contacts"
     )
 
 
@@ -176,7 +178,8 @@ def _blow_lines(inventory: Inventory, contact: str, tapped: str) -> dict[str, st
     if inventory.bounces:
         e = max(one.e for one in inventory.bounces)
         back = (
-            f"1 m/s comes back as {e:.2g} m/s, a fall of 100 mm rebounds to {100.0 * e * e:.2g} mm"
+            f"1 m/s comes back as {format_number(e, 2)} m/s, a fall of 100 mm rebounds to "
+            f"{format_number(100.0 * e * e, 2)} mm"
             if contact == RIGID
             else "how far depends on the time step, too"
         )
@@ -217,7 +220,7 @@ def print_inventory(inventory: Inventory, contact: str, tapped: str) -> None:
         if largest:
             lines[f"{kind} rows"] = f"at most {largest} in a step, median {median:g}"
     if inventory.stiffness is not None:
-        least, most = (f"{float(f'{1e-3 * each:.3g}'):,g}" for each in inventory.stiffness)
+        least, most = (f"{float(f'{1e-3 * each:.3g}'):,.15g}" for each in inventory.stiffness)
         depth = length(abs(inventory.deepest))
         sank = f"sank in by {depth}" if inventory.deepest >= 0.0 else f"a margin kept {depth} away"
         lines["contact stiffness"] = (

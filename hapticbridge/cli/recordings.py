@@ -11,7 +11,7 @@ from typing import Literal
 
 from hapticbridge.arguments import option, shared
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress
-from hapticbridge.errors import RecordingError
+from hapticbridge.errors import RecordingError, choices
 from hapticbridge.files import atomic_write, check_target
 from hapticbridge.recording import read_recording
 from hapticbridge.replay.film import USUAL_SHOT, Shot, draw
@@ -192,12 +192,14 @@ class Export:
             facts = {"files": [str(file) for file in done.files], "ticks": done.ticks}
             facts |= {"marks": marks, "is_cut": bool(recording.cut_sentence)}
             facts |= {"cut": recording.cut_sentence, "damage": recording.problems}
+            facts |= {"coupled": done.coupled}
             print_json(facts)
         else:
             names = ", ".join(plain(str(file)) for file in done.files)
             out.print(f"wrote {names}: {done.ticks} ticks, {len(done.events)} events")
             if marks:
                 out.print(f"marks at {', '.join(f'{time:.3f} s' for time in marks)}")
+        _tell_coupled(done.coupled)
         if recording.cut_sentence:
             err.print(f"[yellow]warning:[/yellow] {recording.cut_sentence}; this is what it holds")
         if recording.problems:
@@ -227,6 +229,7 @@ class Export:
             count = len(done.episodes)
             episodes = "1 episode" if count == 1 else f"{count} episodes"
             out.print(f"wrote {plain(str(done.folder))}: {episodes}, {frames}")
+        _tell_coupled(done.coupled)
         for file, resets, end in zip(self.files, done.resets, done.ends, strict=True):
             if end:
                 told = plain(f"{file}: {end}; look at its episode")
@@ -238,6 +241,16 @@ class Export:
                     f"{times}: its episode jumps there; an episode needs a recording of its own"
                 )
         return 0
+
+
+def _tell_coupled(names: tuple[str, ...]) -> None:
+    """Prints which readings of sensors include the coupling's pull on the tool."""
+    if names:
+        err.print(
+            f"[yellow]warning:[/yellow] {plain(choices(names))}: these readings include the "
+            "coupling's pull on the tool, which MuJoCo takes for a motor's, and a real sensor "
+            "there would not; 'hapticbridge check' says what to subtract"
+        )
 
 
 @dataclass(frozen=True, slots=True)

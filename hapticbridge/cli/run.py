@@ -13,7 +13,6 @@ from signal import Signals
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import mujoco
-import numpy as np
 from rich.markup import escape
 
 from hapticbridge.arguments import option, shared
@@ -74,10 +73,10 @@ from hapticbridge.scene.compile import custom_text
 from hapticbridge.scene.fault import weight
 from hapticbridge.scene.first_faults import worst_faults
 from hapticbridge.scene.physics import tool_masses
-from hapticbridge.scene.rehearsal import static_load
+from hapticbridge.scene.rehearsal import static_load, wrench_sizes
 from hapticbridge.scene.softness import bounces
 from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
-from hapticbridge.units import format_energy, format_number, format_si
+from hapticbridge.units import format_degrees, format_energy, format_number, format_si
 
 if TYPE_CHECKING:
     from hapticbridge.view import Window
@@ -168,8 +167,8 @@ def _announce_damping(setup: RunSetup, named: Mapping[str, float]) -> None:
         least = getattr(setup.attainable, name)
         if name in named and named[name] < least * (1.0 - 1e-9):
             err.print(
-                f"  {symbol} = {named[name]:g} {unit} is less than the {least:.4g} that method "
-                f"{setup.method.name} shows at this stiffness and rate"
+                f"  {symbol} = {named[name]:g} {unit} is less than the {format_number(least)} that "
+                f"method {setup.method.name} shows at this stiffness and rate"
             )
 
 
@@ -189,8 +188,9 @@ def _announce_own_rate(setup: RunSetup) -> None:
     usual = default_coupling(info, own, *scales, setup.law_evaluations, method)
     if usual.stiffness > setup.coupling.stiffness:
         err.print(
-            f"  the device gives {1 / own:.4g} new samples per second, and each force is held: "
-            f"--rate {format_number(1 / own)} would allow {format_number(usual.stiffness, 3)} N/m"
+            f"  the device gives {format_number(1 / own)} new samples per second, and each force "
+            f"is held: --rate {format_number(1 / own)} would allow "
+            f"{format_number(usual.stiffness, 3)} N/m"
         )
 
 
@@ -198,12 +198,13 @@ def _announce_slow(setup: RunSetup) -> None:
     rate, scales = 1.0 / setup.scene_period, setup.workspace.scales
     if setup.credit:
         err.print(
-            f"  another program shows its tool, {rate:.4g} times per second or as it can; the hand "
-            f"gets at most what it put in plus {format_energy(setup.credit)}"
+            f"  another program shows its tool, {format_number(rate)} times per second or as it "
+            f"can; the hand gets at most what it put in plus {format_energy(setup.credit)}"
         )
         return
     err.print(
-        f"  the scene steps at {rate:.4g} Hz beside the loop, and its tool is shown in between"
+        f"  the scene steps at {format_number(rate)} Hz beside the loop, and its tool is shown in "
+        "between"
     )
     most = steady_stiffness(setup.scene, setup.info, setup.scene_period, *scales)
     if setup.coupling.stiffness > 2.0 * most:
@@ -215,7 +216,8 @@ def _announce_slow(setup: RunSetup) -> None:
     if setup.coupling.rotational_stiffness > 2.0 * most:
         err.print(
             "[yellow]warning:[/yellow] at this scene rate the tool may shake above about "
-            f"{2.0 * most:.2g} N m/rad: lower --rotational-stiffness, or raise --scene-rate"
+            f"{format_number(2.0 * most, 2)} N m/rad: lower --rotational-stiffness, or raise "
+            "--scene-rate"
         )
 
 
@@ -278,47 +280,61 @@ def _findings(source: SceneSource, scene: Scene) -> tuple[str, ...]:
 
 
 HEAVY = 0.25
-"""Share of the force limit above which a sentence tells the tool's load; no unit."""
+"""Share of the force or torque limit above which a sentence tells the tool's load; no unit."""
 
 
 def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]:
-    """Yields a sentence on the load of the tool at rest, if it is a heavy one."""
-    load = parameters.guarding.idle_force - setup.guard.idle_force
-    in_hand = setup.workspace.scales[1] * load
-    if setup.scene.joint >= 0 or not (
-        setup.method.has_law and HEAVY * setup.limits.force < in_hand < math.inf
-    ):
+    """Yields a sentence on the load of the tool at rest, for its force and torque if heavy."""
+    if setup.scene.joint >= 0 or not setup.method.has_law:
         return
-    scale, sag = in_hand / load, format_si(load / parameters.coupling.stiffness, "m")
-    others = static_load(setup.scene, parameters, has_weight=False)[:3]
-    if 2.0 * float(np.linalg.norm(others)) > load:
-        yield (
-            f"at rest the hand bears {format_si(in_hand, 'N')}, {sag} beside the handle, most of "
+    loads, limits = setup.load_at_rest(parameters), (setup.limits.force, setup.limits.torque)
+    for part in range(1 + setup.info.turns):
+        if HEAVY * limits[part] < setup.on_device(loads)[part] < math.inf:
+            yield _heavy_load(setup, parameters, part)
+
+
+def _heavy_load(setup: RunSetup, parameters: RunParameters, part: int) -> str:
+    """Returns the sentence on a heavy load; part 0 is the force, 1 the torque."""
+    scene, load = setup.scene, setup.load_at_rest(parameters)[part]
+    coupling, unit = parameters.coupling, ("N", "N m")[part]
+    beside = (
+        format_degrees(load / coupling.rotational_stiffness)
+        if part
+        else format_si(load / coupling.stiffness, "m")
+    )
+
+    def in_hand(sizes: tuple[float, float]) -> str:
+        return format_si(setup.on_device(sizes)[part], unit)
+
+    felt = in_hand(setup.load_at_rest(parameters))
+    others = wrench_sizes(static_load(scene, parameters, has_weight=False))
+    if 2.0 * others[part] > load:
+        return (
+            f"at rest the hand bears {felt}, {beside} beside the handle, most of "
             "it from motors, springs or parts of the scene that push the tool"
         )
-    elif setup.scene.is_carried:
-        yield (
-            f"at rest the hand bears {format_si(in_hand, 'N')}, {sag} beside the handle, from what "
+    if scene.is_carried:
+        return (
+            f"at rest the hand bears {felt}, {beside} beside the handle, from what "
             'hangs or lies on the tool, whose weight is carried; gravcomp="1" in these bodies '
             "carries them"
         )
-    else:
-        carried = static_load(setup.scene.with_tool_carried(), parameters)[:3]
-        left = float(np.linalg.norm(carried))
-        own, whole = tool_masses(setup.scene.model, setup.scene.grip)
-        subject = "this tool"
-        if own < 0.5 * whole:
-            subject += f" with its links ({weight(whole)}, without them {weight(own)})"
-        cause = f"{subject} weighs {format_si(in_hand, 'N')} in the hand, which holds it {sag}"
-        if 2.0 * left > load:
-            cause = (
-                f"what hangs or lies on the tool weighs most of the {format_si(in_hand, 'N')} that "
-                f"the hand bears {sag}"
-            )
-        yield (
-            f"{cause} beside the handle; --no-tool-weight carries the tool alone (tried: the hand "
-            f"then bears {format_si(scale * left, 'N')})"
+    left = wrench_sizes(static_load(scene.with_tool_carried(), parameters))
+    own, whole = tool_masses(scene.model, scene.grip)
+    subject = "this tool"
+    if own < 0.5 * whole:
+        subject += f" with its links ({weight(whole)}, without them {weight(own)})"
+    verb = f"turns the hand with {felt}" if part else f"weighs {felt} in the hand"
+    cause = f"{subject} {verb}, which holds it {beside}"
+    if 2.0 * left[part] > load:
+        verb = "makes" if part else "weighs"
+        cause = (
+            f"what hangs or lies on the tool {verb} most of the {felt} that the hand bears {beside}"
         )
+    return (
+        f"{cause} beside the handle; --no-tool-weight carries the tool alone (tried: the hand "
+        f"then bears {in_hand(left)})"
+    )
 
 
 def is_mouse(device: str) -> bool:
@@ -534,8 +550,9 @@ class Run:
         is_own = any(info.loop_period is not None for info in infos)
         if self.options.rate is None and options.loop_rate < USUAL_RATE and not is_own:
             notify(
-                f"the loop runs at {options.loop_rate:.4g} Hz, as often as the device has a new "
-                f"sample: it bears stiffer walls so than at {USUAL_RATE:g} Hz (--rate sets another)"
+                f"the loop runs at {format_number(options.loop_rate)} Hz, as often as the device "
+                f"has a new sample: it bears stiffer walls so than at {USUAL_RATE:g} Hz (--rate "
+                "sets another)"
             )
         return replace(self, options=options)
 

@@ -23,6 +23,7 @@ from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.law import STOPPED_TWIST
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, OFF, GuardParameters
 from hapticbridge.kernel.tick_guard import FARTHEST
+from hapticbridge.units import format_number
 
 # Limits of the wrench and of the run
 
@@ -223,8 +224,8 @@ def refuse_implausible_pose(info: DeviceInfo, sample: NDArray[np.void]) -> None:
     if not distance <= reach:
         raise DeviceError(
             f"the device '{info.name}' reports {np.round(position, 4).tolist()} m, "
-            f"{distance:.3g} m from the middle of its workspace; it reaches {reach:.3g} m: home or "
-            "calibrate it, and check the unit of its poses"
+            f"{format_number(distance, 3)} m from the middle of its workspace; it reaches "
+            f"{format_number(reach, 3)} m: home or calibrate it, and check the unit of its poses"
         )
 
 
@@ -268,10 +269,10 @@ def refuse_stretched_start(
     if force > limits.force:
         hand = f"hand at '{grip}': " if grip else ""
         raise DeviceError(
-            f"{hand}the device's absolute pose puts the handle "
-            f"{1e3 * distance:.3g} mm from the grip, "
-            f"{force:.3g} N at the start; the limit is {limits.force:g} N: start nearer to "
-            f"{np.round(pose['tool_position'], 4).tolist()} m or use relative poses"
+            f"{hand}the device's absolute pose puts the handle {format_number(1e3 * distance, 3)} "
+            f"mm from the grip, {format_number(force, 3)} N at the start; the limit is "
+            f"{limits.force:g} N: start nearer to {np.round(pose['tool_position'], 4).tolist()} m "
+            "or use relative poses"
         )
 
 

@@ -36,7 +36,7 @@ from hapticbridge.kernel.parameters import ROUNDING, RunParameters
 from hapticbridge.kernel.record import TickFlag
 from hapticbridge.theory.bounds import minimum_damping
 from hapticbridge.theory.transfer import MAX_DELAY, CouplingGrid
-from hapticbridge.units import format_si
+from hapticbridge.units import format_number, format_si
 
 NOT_KEPT = "the run did not keep its time"
 SCENE_BEHIND = "behind the device's delay the scene created energy"
@@ -271,27 +271,31 @@ class Timekeeping:
         lost = "" if self.fresh >= self.share else f", {self._shortfall}"
         late = f", {self._late}" if self._late else ""
         if self.scene_rate is not None:
-            speed = f"{100.0 * self.scene_speed:.3g} % of its speed"
-            late += f", the scene at {self.scene_rate:.4g} Hz and {speed}"
+            speed = f"{format_number(100.0 * self.scene_speed, 3)} % of its speed"
+            late += f", the scene at {format_number(self.scene_rate)} Hz and {speed}"
             if self.scene_silence * self.scene_rate > SILENT_PERIODS:
                 late += f", once without a result for {format_si(self.scene_silence, 's')}"
         if self.shown_rate is not None:
-            late += f", {self.shown_rate:.4g} poses per second from the program"
+            late += f", {format_number(self.shown_rate)} poses per second from the program"
             if self.scene_silence > 2.0 / max(self.shown_rate, 1e-9):
                 late += f", once none for {format_si(self.scene_silence, 's')}"
         of_what = "new samples at " if lost else ""
-        return f"{of_what}{self.rate:.4g} Hz, {self._percent} of the deadlines kept{lost}{late}"
+        return (
+            f"{of_what}{format_number(self.rate)} Hz, {self._percent} of the deadlines "
+            f"kept{lost}{late}"
+        )
 
     @property
     def _shortfall(self) -> str:
         """Samples that came and that were due, with the rate that suits the device."""
         counts = (
-            f"{self.fresh * self.due_rate:.4g} of the {self.due_rate:.4g} new samples per second"
+            f"{format_number(self.fresh * self.due_rate)} of the {format_number(self.due_rate)} "
+            "new samples per second"
         )
         counts += " that the device states" if self.is_rate_stated else " that the loop reads"
         if not self.sample_rate or self.slowness:
             return counts
-        rate = f"{self.sample_rate:.4g}"
+        rate = format_number(self.sample_rate)
         return f"{counts} (--rate {rate}, or rate={rate} in its data sheet, suits it)"
 
     @property
@@ -339,9 +343,9 @@ class Timekeeping:
         if not self.sample_rate or self.is_kept:
             return ""
         return (
-            f"; the device gave new samples at {self.sample_rate:.4g} Hz; in the ticks between "
-            "them the handle slips toward the tool, so that the hand feels less force: try "
-            f"{self.remedy}"
+            f"; the device gave new samples at {format_number(self.sample_rate)} Hz; in the ticks "
+            "between them the handle slips toward the tool, so that the hand feels less force: "
+            f"try {self.remedy}"
         )
 
     @property
@@ -366,14 +370,18 @@ class Timekeeping:
                 f"{SCENE_BEHIND}, and it may have given the hand {given}, which no slack pays "
                 "there; 'hapticbridge check' looks for what creates it"
             )
-        at_times = f"at {self.rate:.4g} Hz{f' ({self._late})' if self._late else ''} it would need"
+        at_times = (
+            f"at {format_number(self.rate)} Hz{f' ({self._late})' if self._late else ''} it would "
+            "need"
+        )
         pairs = zip(self.conditions, self.in_time, strict=True)
         failed = [(late, usual) for late, usual in pairs if late.holds is False]
         if failed:
             late_one, usual = failed[0]
             reason = (
-                f"{at_times} {late_one.needed:.3g} {usual.unit} of damping in {usual.axis} "
-                f"({usual.needed:.3g} with every tick in time), and has {usual.available:.3g}"
+                f"{at_times} {format_number(late_one.needed, 3)} {usual.unit} of damping in "
+                f"{usual.axis} ({format_number(usual.needed, 3)} with every tick in time), and has "
+                f"{usual.available:.3g}"
             )
         else:
             is_behind = any(each.delay for each in self.in_time)
@@ -413,7 +421,7 @@ _OWN_REMEDY = "a lower --stiffness, or less work for the board in each of its pe
 
 def _remedy(is_realtime: bool, sample_rate: float) -> str:
     if sample_rate:
-        return f"--rate {sample_rate:.4g} with the stiffness left to the run"
+        return f"--rate {format_number(sample_rate)} with the stiffness left to the run"
     request = "" if is_realtime else "--realtime, "
     return (
         f"{request}a lower --stiffness, a lower --rate with the stiffness left to the run, or what "

@@ -24,6 +24,7 @@ from hapticbridge.device.trajectory import (
     first_fault,
 )
 from hapticbridge.errors import DeviceError, choices
+from hapticbridge.units import format_number
 
 # Table in CSV
 
@@ -215,14 +216,18 @@ def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
     is_slow = len(table) >= MANY_ROWS and step >= MAX_STEP
     speed = float(np.median(ways / steps)) * (_SMALLER[unit] if is_slow else 1.0)
     if span > MAX_SPAN and speed > USUAL_SPEED_LIMIT:
-        also = f", and rows {step:.3g} s apart, as times in {unit} have" if is_slow else ""
+        also = (
+            f", and rows {format_number(step, 3)} s apart, as times in {unit} have"
+            if is_slow
+            else ""
+        )
         raise DeviceError(
-            f"{path}: the motion spans {span:.3g} m at {speed:.3g} m/s{also}; positions are in m "
-            "and times in s: if these are mm, divide them by 1000"
+            f"{path}: the motion spans {format_number(span, 3)} m at {format_number(speed, 3)} "
+            f"m/s{also}; positions are in m and times in s: if these are mm, divide them by 1000"
         )
     if is_slow:
         warnings.warn(
-            f"{path}: rows are {step:.3g} s apart, and the motion takes "
+            f"{path}: rows are {format_number(step, 3)} s apart, and the motion takes "
             f"{np.ptp(table[:, 0]):.3g} s; times are in s: if these are {unit}, divide by "
             f"{_SMALLER[unit]:.0f}",
             stacklevel=3,

@@ -39,6 +39,7 @@ from hapticbridge.device.simulated.device import (
 from hapticbridge.device.simulated.dynamics import Hand
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
 from hapticbridge.errors import DeviceError, choices, nearest
+from hapticbridge.files import foreign_kind
 from hapticbridge.kernel.codes import Grip
 from hapticbridge.scene import Scene
 
@@ -481,17 +482,6 @@ def _named_topic(text: str) -> tuple[Path, str]:
     return bags[0] if len(bags) == 1 else path, f"/{topic}" if is_named else ""
 
 
-_PACKED = "compressed as a whole file; what {} makes of it is read"
-_OTHER_BAGS = {
-    ".db3": "a bag of ROS 2 in SQLite; 'ros2 bag convert' writes it in MCAP, which is read",
-    ".bag": "a bag of ROS 1; 'rosbags-convert --dst-storage mcap' makes it one of ROS 2, in MCAP",
-    ".zstd": _PACKED.format("'zstd -d'"),
-    ".zst": _PACKED.format("'zstd -d'"),
-    ".gz": _PACKED.format("'gunzip'"),
-}
-"""Reason why a file is no motion and what makes it one, by its ending."""
-
-
 def _refuse_other_bag(path: Path) -> None:
     """Refuses a bag of another kind, and a folder of several bags.
 
@@ -505,7 +495,7 @@ def _refuse_other_bag(path: Path) -> None:
     bags = [file.name for file in files if file.suffix == ".mcap"]
     if len(bags) > 1:
         raise DeviceError(f"{path}: a folder of {len(bags)} files; name one of {choices(bags[:8])}")
-    if kind := next((_OTHER_BAGS[file.suffix] for file in files if file.suffix in _OTHER_BAGS), ""):
+    if kind := next(filter(None, map(foreign_kind, files)), ""):
         raise DeviceError(f"{path}: {kind}")
 
 

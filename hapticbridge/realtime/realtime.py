@@ -37,6 +37,7 @@ from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.scene import Scene
+from hapticbridge.units import format_number
 
 # Time stolen by the host of a virtual machine
 
@@ -143,12 +144,12 @@ def check_pace(
     needed = substeps * step_time(scene, method)
     if needed <= period:
         return
-    held = float(f"{rate_for(needed):.2g}")  # two digits, and no exponent
+    held = format_number(rate_for(needed), 2)
     message = (
-        f"scene '{scene.name}' needs {needed * 1e3:.3g} ms of MuJoCo a tick at its start, the "
-        f"period is {period * 1e3:.3g} ms; it could hold about {held:g} Hz: "
-        f"{'leave out --scene-rate' if method.can_be_slow else 'choose another --method'}, lower "
-        "the rate, or find the cause with 'hapticbridge check'"
+        f"scene '{scene.name}' needs {format_number(needed * 1e3, 3)} ms of MuJoCo a tick at its "
+        f"start, the period is {format_number(period * 1e3, 3)} ms; it could hold about {held} "
+        f"Hz: {'leave out --scene-rate' if method.can_be_slow else 'choose another --method'}, "
+        "lower the rate, or find the cause with 'hapticbridge check'"
     )
     if is_real:
         raise SceneError(message)
@@ -160,8 +161,9 @@ def warn_of_slow_motion(scene: Scene, method: Method, period: float, substeps: i
     needed = substeps * step_time(scene, method)
     if needed > period:
         warnings.warn(
-            f"scene '{scene.name}' needs {needed * 1e3:.3g} ms for {period * 1e3:.3g} ms of its "
-            f"time, so it runs in slow motion; it can keep --scene-rate {SPARE / needed:.2g}",
+            f"scene '{scene.name}' needs {format_number(needed * 1e3, 3)} ms for "
+            f"{format_number(period * 1e3, 3)} ms of its time, so it runs in slow motion; it can "
+            f"keep --scene-rate {format_number(SPARE / needed, 2)}",
             stacklevel=2,
         )
 

@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
-from hapticbridge.files import import_extra, read_json
+from hapticbridge.files import foreign_kind, import_extra, read_json
 from hapticbridge.kernel.record import FLAG_LEGEND, SECONDS, TICK_DTYPE, TableColumns
 from hapticbridge.recording import format as layout
 from hapticbridge.recording import ros_messages
@@ -220,8 +220,11 @@ class Contents:
             self._derived.add(ros_messages.LOG, *line)
 
     def _expected(self) -> ros_messages.Messages | None:
-        """Returns what derives the messages for ROS 2; None for a file without them."""
-        if not self.has_messages or not self.keeps_events or self.meta_ahead is None:
+        """Returns what derives the messages for ROS 2; None if they are not compared.
+
+        A file without summary may name them behind its ticks and events, so all are derived.
+        """
+        if not self.keeps_events or self.meta_ahead is None:
             return None
         if self._messages is None:
             axes = ros_messages.axes_of(self.meta_ahead)
@@ -230,7 +233,9 @@ class Contents:
 
     def message_fault(self) -> str:
         """Returns a sentence if the messages for ROS 2 do not follow from the ticks; else empty."""
-        if differing := self._expected() and self._written.differing(self._derived):
+        if not self.has_messages or self._expected() is None:
+            return ""
+        if differing := self._written.differing(self._derived):
             return f"what {choices(differing)} say does not follow from the ticks and events"
         return ""
 
@@ -550,6 +555,14 @@ def _read_through(
     return facts, contents.attachments
 
 
+def foreign_file(path: Path) -> str:
+    """Returns the kind of a bag or packed file, as ``files.foreign_kind``, for who reads runs."""
+    kind = foreign_kind(path)
+    if kind.startswith("a bag"):
+        kind += " as a motion; only what 'hapticbridge run' wrote is a recording"
+    return kind
+
+
 def _hands_in(path: Path, meta: Mapping[str, str], hand: int | None, problems: list[str]) -> int:
     """Returns the number of hands in a file; damaged metadata count as one hand.
 
@@ -580,6 +593,8 @@ def _read_parts(
     """Reads a file; yields its container and contents after every part."""
     with FileBytes(path) as data:
         if data[: len(MAGIC)] != MAGIC:
+            if kind := foreign_file(path):
+                raise RecordingError(f"{path} is {kind}")
             what = "it is empty" if not len(data) else "it does not start with the MCAP magic"
             raise RecordingError(f"{path} is not an MCAP file: {what}")
         container = Container(data)

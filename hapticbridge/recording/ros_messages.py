@@ -30,6 +30,10 @@ RATE = 60
 """Messages per second on each topic, for 1 kHz: one in 16 or 17 ticks. What is looked at needs no
 more, and the file grows by a tenth."""
 
+LAST_STAMP = 2**31 * 10**9 - 1
+"""Last Unix time in ns that fits the 32 bits of a stamp's seconds, in January 2038. Later messages
+keep it, so that none seems to be of 1901 or 1970; their log time in MCAP goes on."""
+
 WORLD, HANDLE, TOOL = "world", "handle", "tool"
 """Names of the frames."""
 
@@ -213,8 +217,7 @@ class Messages:
         rows = rows[is_first]
         times = rows["deadline_ns"].astype(np.uint64) + np.uint64(self._epoch)
         filled = {topic: np.repeat(template, rows.size) for topic, template in _TEMPLATES.items()}
-        sec, nanosec = np.divmod(times, np.uint64(10**9))
-        stamps = np.stack([sec & np.uint64(0x7FFFFFFF), nanosec], axis=1)
+        stamps = np.stack(np.divmod(np.minimum(times, LAST_STAMP), 10**9), axis=1)
         for frame in (HANDLE, TOOL):
             pose = _ros_pose(rows, frame)
             filled[TF][f"{frame}_stamp"] = stamps
@@ -246,7 +249,7 @@ class Messages:
         line = _Cdr().numbers("stamp", "<u4", 2).numbers("level", "u1", 1)
         line.text(PROGRAM).text(payload.decode(errors="replace")).text("").text("").count(0)
         message = line.template()
-        message["stamp"] = time // 10**9 & 0x7FFFFFFF, time % 10**9
+        message["stamp"] = divmod(min(time, LAST_STAMP), 10**9)
         message["level"] = ERROR if name in FAULTS else INFO
         return time, message.tobytes()
 

@@ -36,6 +36,7 @@ from hapticbridge.replay.stage import (
     Frame,
     Stage,
     film_ticks,
+    sensor_names,
     write_animation,
     write_film,
 )
@@ -177,8 +178,8 @@ def states(recording: Path, shot: Shot, progress: Progress | None = None) -> dic
 
     Returns:
         ``rows`` (records, (n,)), ``qpos`` (n, nq), ``qvel`` (n, nv), ``ctrl`` (n, nu), ``sensors``,
-        ``names`` of positions, ``controls`` of ``ctrl``, ``sensor_names``, and with a camera
-        ``pictures``, a PNG each.
+        ``names`` of positions, ``controls`` of ``ctrl``, ``sensor_names``, ``coupled_readings`` as
+        of ``SensorValues``, and with a camera ``pictures``, a PNG each.
 
     Raises:
         HapticBridgeError: As ``draw``.
@@ -198,11 +199,13 @@ class SensorValues(NamedTuple):
         names: Name of each number (k,).
         ticks: Number of each tick (n,), increasing.
         values: The readings (n, k), in MuJoCo's units.
+        coupled: Names of those numbers that include the coupling's pull on the tool.
     """
 
     names: tuple[str, ...]
     ticks: NDArray[np.int64]
     values: NDArray[np.float64]
+    coupled: tuple[str, ...]
 
 
 def sensors(recording: Path) -> SensorValues:
@@ -217,7 +220,8 @@ def sensors(recording: Path) -> SensorValues:
     if not names:
         raise HapticBridgeError(f"the scene of '{recording}' has no sensors")
     ticks = np.frombuffer(found["ticks"], np.int64)
-    return SensorValues(names, ticks, np.frombuffer(found["values"]).reshape(len(ticks), -1))
+    values = np.frombuffer(found["values"]).reshape(len(ticks), -1)
+    return SensorValues(names, ticks, values, tuple(found["coupled"]))
 
 
 def still(recording: str | Path, shot: Shot, *, in_process: bool = False) -> bytes:
@@ -408,7 +412,8 @@ def _states(path: Path, shot: Shot, worker: Worker) -> dict[str, Any]:
         "qvel": qvel,
         "ctrl": ctrl,
         "sensors": np.array(readings),
-        "sensor_names": _sensor_names(model),
+        "sensor_names": sensor_names(model),
+        "coupled_readings": stage.coupled_readings(),
         "names": names,
         "controls": list(controls.values()),
         "pictures": pictures,
@@ -432,26 +437,17 @@ def _control_names(model: mujoco.MjModel) -> dict[int, str]:
 def _sensors(path: Path, worker: Worker) -> dict[str, Any]:
     """Returns what ``sensors`` does, as bytes."""
     stage = Stage(open_recording(path, 0), worker.allow_run)
-    ticks, values, names = [], [], _sensor_names(stage.model)
+    ticks, values, names = [], [], sensor_names(stage.model)
     for row in range(stage.recording.count if names else 0):
         stage.show(row)
         ticks.append(int(stage.row["tick"][0]))
         values.append(stage.data.sensordata.tobytes())
-    return {"names": names, "ticks": np.array(ticks).tobytes(), "values": b"".join(values)}
-
-
-def _sensor_names(model: mujoco.MjModel) -> list[str]:
-    """Returns a name of each number that a scene's sensors give, all different.
-
-    None has a slash, which separates groups in HDF5.
-    """
-    names: list[str] = []
-    for sensor, size in enumerate(model.sensor_dim.tolist()):
-        name = (model.sensor(sensor).name or str(sensor)).replace("/", "_")
-        for number in [f"{name}_{k}" for k in range(size)] if size > 1 else [name]:
-            count = sum(each.partition("~")[0] == number for each in names)
-            names.append(f"{number}~{count}" if count else number)
-    return names
+    return {
+        "names": names,
+        "ticks": np.array(ticks).tobytes(),
+        "values": b"".join(values),
+        "coupled": stage.coupled_readings(),
+    }
 
 
 _POSITIONS = {

@@ -22,6 +22,7 @@ from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
 from hapticbridge.recording.ring import MAX_CONTACTS
 from hapticbridge.replay.blow import NewestBlow, newest_blow
+from hapticbridge.scene.checks import coupled_sensors
 
 PLACE = 1e-4
 """Largest distance in m between the tool, simulated again, and its record. It is less than a pixel.
@@ -267,6 +268,15 @@ class Stage:
         """Grips of the hands; a joint has no place in the scene."""
         return tuple(own.grip for own in self._hands if not own.is_joint)
 
+    def coupled_readings(self) -> list[str]:
+        """Returns the names of the sensors' numbers that include the coupling's pull."""
+        names, model = sensor_names(self.model), self.model
+        return [
+            names[int(model.sensor_adr[sensor]) + k]
+            for sensor in coupled_sensors(model, *(own.grip for own in self._hands))
+            for k in range(int(model.sensor_dim[sensor]))
+        ]
+
     def hands(self) -> Iterator[tuple[NDArray[np.void], NDArray[np.float64]]]:
         """Yields the record (1,) of each hand at a grip, and the force on it in N, (3,)."""
         for hand, own in enumerate(self._hands):
@@ -352,6 +362,20 @@ COLOURLESS = 0.5, 0.5, 0.5, 1.0
 TOOL_COLOUR, MOVING_COLOUR, FIXED_COLOUR = (0.8, 0.5, 0.25), (0.5, 0.65, 0.55), (0.6, 0.62, 0.65)
 """Colours of colourless geoms on the tool, on other moving bodies and on fixed ones, 0 to 1.
 Without them, tool and floor are grey on grey."""
+
+
+def sensor_names(model: mujoco.MjModel) -> list[str]:
+    """Returns a name of each number that a scene's sensors give, all different.
+
+    None has a slash, which separates groups in HDF5.
+    """
+    names: list[str] = []
+    for sensor, size in enumerate(model.sensor_dim.tolist()):
+        name = (model.sensor(sensor).name or str(sensor)).replace("/", "_")
+        for number in [f"{name}_{k}" for k in range(size)] if size > 1 else [name]:
+            count = sum(each.partition("~")[0] == number for each in names)
+            names.append(f"{number}~{count}" if count else number)
+    return names
 
 
 def tell_apart(model: mujoco.MjModel, *grips: str) -> None:

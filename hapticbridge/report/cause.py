@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
@@ -29,8 +29,9 @@ from hapticbridge.report.evidence import Evidence
 from hapticbridge.run.commands import UNITS
 from hapticbridge.scene.checks import first_pump, unmetered_work
 from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
+from hapticbridge.scene.physics import STEADY_WAY, Lengths
 from hapticbridge.theory.bounds import NEEDED_SHARE
-from hapticbridge.units import format_energy
+from hapticbridge.units import format_count, format_energy, format_number, format_si
 
 Kind = Literal[
     "method",
@@ -42,6 +43,7 @@ Kind = Literal[
     "damping",
     "quantisation",
     "unmetered work",
+    "jumping tendon",
     "unknown",
 ]
 
@@ -117,7 +119,7 @@ def _method_cause(method: Method, where: str = "") -> Cause:
 def _failing_words(failing: list[DampingCondition]) -> str:
     return "; ".join(
         f"{c.axis}: the device's damping is {c.available:g} {UNITS[c.axis][1]}, the coupling needs "
-        f"{c.needed:.4g}"
+        f"{format_number(c.needed)}"
         for c in failing
     )
 
@@ -137,8 +139,9 @@ def _delay_cause(evidence: Evidence, failing: list[DampingCondition]) -> Cause |
         return None
     return Cause(
         "delay",
-        f"{prompt:.3g} N s/m of damping would bear the coupling without delay, the device has "
-        f"{own:.3g}; its samples are {late} ticks old; {_failing_words(failing)}",
+        f"{format_number(prompt, 3)} N s/m of damping would bear the coupling without delay, the "
+        f"device has {format_number(own, 3)}; its samples are {late} ticks old; "
+        f"{_failing_words(failing)}",
         f"shorten the delay, or {_remedies(failing)}",
     )
 
@@ -150,7 +153,8 @@ def _overload_cause(evidence: Evidence, failing: list[DampingCondition]) -> Caus
     if failing[0].axis == "translation" and damper > NEEDED_SHARE * own:
         return Cause(
             "damping",
-            f"{_failing_words(failing)}; its damper alone needs {damper:.4g} at any rate",
+            f"{_failing_words(failing)}; its damper alone needs {format_number(damper)} at any "
+            "rate",
             _remedies(failing),
         )
     return Cause(
@@ -180,8 +184,8 @@ def _timing_cause(evidence: Evidence, window: slice) -> Cause | None:
     if missed:
         return Cause(
             "rate",
-            f"ticks late by a period or more in the {span:.2g} s before: {missed}, so that the "
-            "wrench was held longer than the coupling allows",
+            f"ticks late by a period or more in the {format_number(span, 2)} s before: {missed}, "
+            "so that the wrench was held longer than the coupling allows",
             "lower the rate or the load of the machine ('hapticbridge doctor')",
         )
     repeated = float(np.mean((flags & int(TickFlag.STALE_SAMPLE)) != 0))
@@ -191,8 +195,9 @@ def _timing_cause(evidence: Evidence, window: slice) -> Cause | None:
     if repeated > expected + FEWEST_REPEATS:
         return Cause(
             "delay",
-            f"{repeated:.0%} of the samples in the {span:.2g} s before repeated an older one, "
-            f"{expected:.0%} are expected: the force followed an older position of the handle",
+            f"{repeated:.0%} of the samples in the {format_number(span, 2)} s before repeated an "
+            f"older one, {expected:.0%} are expected: the force followed an older position of the "
+            "handle",
             "mend the link to the device, or lower the rate to what it delivers",
         )
     return None
@@ -227,7 +232,7 @@ def _quantisation_words(evidence: Evidence, window: slice) -> str:
     return (
         f"{share:.0%} of the energy came in ticks whose motion was {COUNTED:g} steps of the "
         f"device's resolution ({info.resolution:g} m) or less; to hold still between steps takes a "
-        f"friction of K D/2 + B_law D/T = {rub:.3g} N, the device's is {has}"
+        f"friction of K D/2 + B_law D/T = {format_number(rub, 3)} N, the device's is {has}"
     )
 
 
@@ -249,21 +254,31 @@ def touched_pairs(
         return None
     if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
         return None
-    ticks, total = evidence.ticks, float(gained.sum())
+    total = float(gained.sum())
     found: defaultdict[frozenset[int], float] = defaultdict(float)
     try:
-        run = Resimulator(evidence.recording, AuditedRun.of(evidence.recording).parameters)
-        for begin in range(0, window.start, BLOCK):
-            run.add(ticks[begin : min(begin + BLOCK, window.start)])
-        for tick, energy in zip(range(window.start, window.stop), gained.tolist(), strict=True):
-            run.add(ticks[tick : tick + 1])
-            contact = run.data.contact
-            touching = contact.geom[contact.efc_address >= 0].tolist()
+        for data, energy in zip(_states_in(evidence, window), gained.tolist(), strict=True):
+            touching = data.contact.geom[data.contact.efc_address >= 0].tolist()
             for pair in {frozenset(geoms) for geoms in touching}:
                 found[pair] += energy / total if total > 0 else 0.0
     except RecordingError:
         return None
     return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def _states_in(evidence: Evidence, window: slice) -> Iterator[mujoco.MjData]:
+    """Simulates a run again; yields the scene after each tick of the window.
+
+    Raises:
+        RecordingError: It cannot be simulated.
+    """
+    ticks = evidence.ticks
+    run = Resimulator(evidence.recording, AuditedRun.of(evidence.recording).parameters)
+    for begin in range(0, window.start, BLOCK):
+        run.add(ticks[begin : min(begin + BLOCK, window.start)])
+    for tick in range(window.start, window.stop):
+        run.add(ticks[tick : tick + 1])
+        yield run.data
 
 
 # Causes of energy created in the environment
@@ -293,7 +308,8 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
             "damps their contacts and welds against rest, so a fast move creates energy",
             "move them slower",
         )
-    if cause := _cause_of_scene(evidence, report, where):
+    own = _cause_of_scene(evidence, report, where)
+    if cause := own or _jump_cause(evidence, report, window, gained):
         return cause
     if share < MOST:
         return _cause_without_contact(evidence, window, where)
@@ -322,6 +338,44 @@ def _cause_of_scene(evidence: Evidence, report: AuditReport, where: str) -> Caus
     return found[0] if found else None
 
 
+def _jump_cause(
+    evidence: Evidence, report: AuditReport, window: slice, gained: NDArray[np.float64]
+) -> Cause | None:
+    """Returns a tendon that jumps as the cause, if its jumps brought most of the energy.
+
+    A jump stretches the tendon's spring, or breaks its limit or constraint, without any work.
+    """
+    model, total = evidence.model, float(gained.sum())
+    if model is None or not model.ntendon or total <= 0.0:
+        return None
+    if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
+        return None
+    at_jump, largest = np.zeros((model.ntendon, gained.size)), np.zeros(model.ntendon)
+    last: Lengths | None = None
+    try:
+        for tick, data in enumerate(_states_in(evidence, window)):
+            now = Lengths.of(data)
+            if last is not None:
+                for tendon, size in now.jumps_since(last, evidence.parameters.period).items():
+                    at_jump[tendon, max(tick - 1, 0) : tick + 2] = 1.0  # lengths lag by a step
+                    largest[tendon] = max(largest[tendon], size)
+            last = now
+    except RecordingError:
+        return None
+    shares = at_jump @ gained / total
+    tendon = int(np.argmax(shares))
+    if shares[tendon] < MOST:
+        return None
+    name = model.tendon(tendon).name or str(tendon)
+    return Cause(
+        "jumping tendon",
+        f"{shares[tendon]:.0%} of the energy created until then came as the length of tendon "
+        f"'{name}' jumped, by up to {format_si(largest[tendon], 'm')} in one tick: its way round a "
+        "geom changed",
+        f"write {STEADY_WAY}",
+    )
+
+
 def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
     method, turned = evidence.method, _largest_turn(evidence, window)
     if method.hazard:
@@ -329,9 +383,9 @@ def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cau
     if turned > FAST_TURN:
         return Cause(
             "rate",
-            f"{where}; the tool turned by up to {turned:.2g} rad a tick "
-            f"({turned / evidence.parameters.period:.3g} rad/s), and MuJoCo takes the gyroscopic "
-            "torque from the start of a step",
+            f"{where}; the tool turned by up to {format_number(turned, 2)} rad a tick "
+            f"({format_number(turned / evidence.parameters.period, 3)} rad/s), and MuJoCo takes "
+            "the gyroscopic torque from the start of a step",
             "raise the rate, or turn the tool slower",
         )
     return Cause(
@@ -355,7 +409,8 @@ def _pair_words(evidence: Evidence, pairs: Pairs) -> str:
     if evidence.model is None:
         return ""
     touching = " touched ".join(geom_name(evidence.model, geom) for geom in sorted(pair))
-    more = f" ({len(pairs) - 1} other pairs touched, too)" if len(pairs) > 1 else ""
+    others = format_count(len(pairs) - 1, "other pair")
+    more = f" ({others} touched, too)" if len(pairs) > 1 else ""
     return f", {share:.0%} while {touching}{more}"
 
 

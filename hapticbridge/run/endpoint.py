@@ -41,6 +41,7 @@ from hapticbridge.run.options import AUTO, BridgeOptions
 from hapticbridge.run.posted_scene import is_post
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.compile import PROGRAM_CREDIT
+from hapticbridge.units import format_number
 
 CREDIT = 0.05
 """Usual credit of another program in J: 5 N over 1 cm, a little more than the guard's usual energy
@@ -322,8 +323,9 @@ class Endpoint:
         stated, found = 1.0 / self._scene_period, (self._shows - 1) / seconds
         if not 1.0 / RATE_RATIO < found / stated < RATE_RATIO:
             warnings.warn(
-                f"the program shows its tool {found:.3g} times per second, and the loop was set up "
-                f"for {stated:.3g} (scene_rate): the usual stiffness and the patience are for that",
+                f"the program shows its tool {format_number(found, 3)} times per second, and the "
+                f"loop was set up for {format_number(stated, 3)} (scene_rate): the usual stiffness "
+                "and the patience are for that",
                 stacklevel=2,
             )
 

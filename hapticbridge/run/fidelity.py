@@ -29,9 +29,9 @@ from hapticbridge.scene import Scene, SceneSource, plain_model
 from hapticbridge.scene.checks import ancestors
 from hapticbridge.scene.compile import reset
 from hapticbridge.scene.handle import copy_values
-from hapticbridge.scene.rehearsal import holding_force
+from hapticbridge.scene.rehearsal import holding_wrench
 from hapticbridge.scene.start import constraint_name
-from hapticbridge.units import format_si
+from hapticbridge.units import format_degrees, format_si
 
 SECONDS = 1.0
 """Time in s that is compared. Later, contacts and chains amplify any difference."""
@@ -182,7 +182,7 @@ class Fidelity:
             cause += f", here of {self.constraint}"
         return (
             f"without a hand, '{first.body}' is after {self.seconds:.2g} s "
-            f"{format_si(first.apart, 'm')} and {np.rad2deg(first.turned):.2g} deg from where the "
+            f"{format_si(first.apart, 'm')} and {format_degrees(first.turned, 2)} from where the "
             f"file's own options take it ({format_si(first.moved, 'm')} from its start, {step})"
             f"{more}; the cause is {cause}"
         )
@@ -454,7 +454,7 @@ class _FileMotion:
 def _force(scene: Scene, setting: RunPoint) -> float:
     """Returns the largest force in N with which a still hand holds the tool; inf if it cannot."""
     try:
-        return holding_force(scene, rehearsal_parameters(scene, setting))
+        return float(holding_wrench(scene, rehearsal_parameters(scene, setting))[0])
     except SceneError:
         return math.inf
 

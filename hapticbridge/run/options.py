@@ -78,12 +78,13 @@ from hapticbridge.scene.physics import geom_inertia, site_inertia
 from hapticbridge.scene.rehearsal import (
     HOLDING_STEPS,
     TIPPED,
-    holding_force,
+    holding_wrench,
     start_handle,
     static_load,
     toppling_force,
+    wrench_sizes,
 )
-from hapticbridge.units import format_si
+from hapticbridge.units import format_count, format_number, format_si
 
 # Options of a user
 
@@ -467,7 +468,7 @@ def _refuse_buttons(options: BridgeOptions, info: DeviceInfo, *, is_recorded: bo
         if button is not None and info.buttons is not None and button >= info.buttons:
             raise DeviceError(
                 f"{name.replace('_', '-')} is button {button}, and the device '{info.name}' "
-                f"has {info.buttons} buttons, numbered from 0"
+                f"has {format_count(info.buttons, 'button')}, numbered from 0"
             )
 
 
@@ -675,9 +676,9 @@ class RunSetup(StepTimes):
     def holding(self, start: NDArray[np.void], effective: Coupling | None) -> RunParameters:
         """Returns the parameters of a run that starts now and whose device can hold the tool.
 
-        If a still hand would need more than the device's force limit because of the tool's weight,
-        or if the tool topples in a moving one and then pulls more, the weight is carried, which
-        replaces the scene's model.
+        If a still hand would need more than the device's force or torque limit because of the
+        tool's weight, or if the tool topples in a moving one and then pulls more, the weight is
+        carried, which replaces the scene's model.
 
         Args:
             start: As for ``parameters``.
@@ -694,32 +695,51 @@ class RunSetup(StepTimes):
         return parameters
 
     def overload(self, parameters: RunParameters) -> str:
-        """Returns why the device cannot hold the tool, as a clause; empty if it can."""
-        scene, most = self.scene, self._sent(parameters.levels_on_tool[0])
+        """Returns why the device cannot hold the tool, as a clause; empty if it can.
+
+        A torque counts on a device that turns. In one without such motors the tool slips, and hangs
+        from the hand.
+        """
+        scene, most = self.scene, self.on_device(parameters.levels_on_tool)
         if not self.method.has_law or self.info.is_prescribed or scene.is_carried:
             return ""
-        if (force := self._sent(holding_force(scene, parameters))) > most:
-            weightless = self._sent(holding_force(scene, parameters, has_weight=False))
-            if weightless > max(most, force / 2):
-                return ""  # motors or springs push, more than the weight
-            unpowered = self._sent(holding_force(scene, parameters, has_motors=False))
-            if (force := min(force, unpowered)) <= most:
-                return ""  # motors push; what they hold of the tool counts for it
-            left = float(np.linalg.norm(static_load(scene.with_tool_carried(), parameters)[:3]))
-            is_laden = 2.0 * left > parameters.guarding.idle_force - self.guard.idle_force
-            at_rest = format_si(self._sent(left), "N")
-            part = f"{at_rest} of it at rest from what hangs or lies on the tool, "
-            return (
-                f"within {format_si(HOLDING_STEPS * parameters.timestep, 's')} it pulls with up to "
-                f"{format_si(force, 'N')}, {part if is_laden else ''}and the device holds "
-                f"{most:.3g} N"
-            )
-        if (force := self._sent(toppling_force(scene, parameters))) > most:
+        pull = self.on_device(holding_wrench(scene, parameters))
+        if over := [part for part in range(1 + self.info.turns) if pull[part] > most[part]]:
+            weightless = self.on_device(holding_wrench(scene, parameters, has_weight=False))
+            unpowered = self.on_device(holding_wrench(scene, parameters, has_motors=False))
+            weight = np.minimum(pull, unpowered)  # what motors hold of the tool counts for it
+            for part in over:
+                # else motors or springs push, more than the weight
+                is_heavy = weightless[part] <= max(most[part], pull[part] / 2)
+                if is_heavy and weight[part] > most[part]:
+                    return self._heavy(parameters, part, float(weight[part]))
+        if pull[0] > most[0]:
+            return ""
+        if (force := float(self.on_device((toppling_force(scene, parameters), 0.0))[0])) > most[0]:
             return (
                 f"it stands upright and topples: {TIPPED:g} m beside, it pulls with "
-                f"{force:.3g} N, and the device holds {most:.3g} N"
+                f"{format_number(force, 3)} N, and the device holds {format_number(most[0], 3)} N"
             )
         return ""
+
+    def _heavy(self, parameters: RunParameters, part: int, weight: float) -> str:
+        """Returns the clause on a weight that pulls (part 0) or turns (part 1) the device."""
+        verb, unit = (("pulls", "N"), ("turns", "N m"))[part]
+        most = self.on_device(parameters.levels_on_tool)[part]
+        left = wrench_sizes(static_load(self.scene.with_tool_carried(), parameters))
+        is_laden = 2.0 * left[part] > self.load_at_rest(parameters)[part]
+        at_rest = format_si(self.on_device(left)[part], unit)
+        laden = f"{at_rest} of it at rest from what hangs or lies on the tool, "
+        return (
+            f"within {format_si(HOLDING_STEPS * parameters.timestep, 's')} it {verb} with up to "
+            f"{format_si(weight, unit)}, {laden if is_laden else ''}and the device holds "
+            f"{format_si(most, unit)}"
+        )
+
+    def load_at_rest(self, parameters: RunParameters) -> tuple[float, float]:
+        """Force in N and torque in N m with which the tool loads the coupling at the start."""
+        own, loaded = self.guard, parameters.guarding
+        return loaded.idle_force - own.idle_force, loaded.idle_torque - own.idle_torque
 
     def carry(self, reason: str) -> None:
         """Lets the scene carry the tools' weight, for a result of ``overload``.
@@ -734,8 +754,10 @@ class RunSetup(StepTimes):
             )
         self.scene.carry_tool(reason)
 
-    def _sent(self, force: float) -> float:
-        return self.workspace.scales[1] * force
+    def on_device(self, sizes: ArrayLike) -> NDArray[np.float64]:
+        """Returns force and torque on the device, of those on the tool."""
+        scale, force_scale = self.workspace.scales
+        return np.asarray(sizes) * (force_scale, force_scale / scale)
 
     def parameters(self, start: NDArray[np.void], effective: Coupling | None) -> RunParameters:
         """Returns the parameters of a run that starts now.

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.errors import SceneError, choices
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, added_actuators, held_body
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, added_actuators, held_body, held_joint
 from hapticbridge.scene.source import REPLACED, SourceFile, read_elements
 
 # Requirements of the rendering methods for comparison on a scene
@@ -444,6 +444,28 @@ def ancestors(model: mujoco.MjModel, body_id: int) -> list[int]:
     while chain[-1] != 0:
         chain.append(int(model.body_parentid[chain[-1]]))
     return chain
+
+
+def coupled_sensors(model: mujoco.MjModel, *grips: str) -> list[int]:
+    """Returns the sensors whose readings include the coupling's pull on the tool.
+
+    MuJoCo counts actuators, of which the coupling is made, as motors of the joints between the grip
+    and the world. It reads their forces in the joints, and what passes from body to body.
+    """
+    links, joints = set[int](), set[int]()
+    for grip in grips:
+        chain, joint = ancestors(model, held_body(model, grip)), held_joint(model, grip)
+        links.update(chain)
+        joints.update([joint] if joint >= 0 else np.flatnonzero(np.isin(model.jnt_bodyid, chain)))
+    passing = (mujoco.mjtSensor.mjSENS_FORCE, mujoco.mjtSensor.mjSENS_TORQUE)
+    return [
+        sensor
+        for sensor, (kind, place) in enumerate(
+            zip(model.sensor_type.tolist(), model.sensor_objid.tolist(), strict=True)
+        )
+        if (kind in passing and int(model.site_bodyid[place]) in links)
+        or (kind == mujoco.mjtSensor.mjSENS_JOINTACTFRC and place in joints)
+    ]
 
 
 def _check_coupling_actuator(model: mujoco.MjModel, name: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -212,3 +213,38 @@ def depth_under(
         else:
             high = middle
     return high
+
+
+# Tendons that jump
+
+JUMP = 1e-4
+"""Change in m of a tendon's length in a tick, beyond that of its speed, from which on it counts as
+a jump. A tendon that leaves a geom which it wraps jumps by mm; a smaller value would tell rounding
+of a blow's tick."""
+
+STEADY_WAY = (
+    'a sidesite="…" at the geom that it wraps, or a geom that it never leaves or never meets'
+)
+"""Change that keeps a tendon from jumping."""
+
+
+class Lengths(NamedTuple):
+    """Lengths of all tendons in m or rad (n,), and their rates."""
+
+    lengths: NDArray[np.float64]
+    rates: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, data: mujoco.MjData) -> Lengths:
+        """Returns copies of the present lengths and rates."""
+        return cls(data.ten_length.copy(), data.ten_velocity.copy())
+
+    def jumps_since(self, before: Lengths, period: float) -> dict[int, float]:
+        """Returns by how much each tendon jumped in a period; only those that did.
+
+        A length L of a smooth path changes by |ΔL| <= T max |L̇| in a period T. The factor of two
+        leaves room for rates within the steps of a tick.
+        """
+        rate = np.maximum(np.abs(before.rates), np.abs(self.rates))
+        beyond = np.abs(self.lengths - before.lengths) - 2.0 * period * rate
+        return {tendon: float(beyond[tendon]) for tendon in np.flatnonzero(beyond > JUMP).tolist()}

@@ -219,7 +219,7 @@ def start_handle(
     """
     coupling, grip = parameters.coupling, scene.grip_pose()
     levels = np.array(parameters.levels_on_tool)
-    carried = load * np.repeat(levels / np.maximum(_sizes(load), levels), 3)
+    carried = load * np.repeat(levels / np.maximum(wrench_sizes(load), levels), 3)
     poses = loaded_handle(grip, carried, parameters), grip
     if poses[0] == grip:
         return grip
@@ -238,12 +238,13 @@ HOLDING_STEPS = 1000
 that tip over slowly, and delay every start."""
 
 
-def holding_force(
+def holding_wrench(
     scene: Scene, parameters: RunParameters, *, has_weight: bool = True, has_motors: bool = True
-) -> float:
-    """Returns the largest force in N with which a still handle holds the tool at first.
+) -> NDArray[np.float64]:
+    """Returns the largest force in N and torque in N m with which a still handle holds the tool.
 
-    The coupling is not limited, and the tool moves freely on it. The scene is not changed.
+    They are those of the first ``HOLDING_STEPS``, about the grip, shape (2,). The coupling is not
+    limited, and the tool moves freely on it. The scene is not changed.
 
     Args:
         scene: The prepared scene, at its start.
@@ -256,7 +257,8 @@ def holding_force(
         handle = scene.grip_pose()
     with _gravity(scene.model, is_on=has_weight), _motors(scene.model, is_on=has_motors):
         steps = Rehearsal(scene, parameters).steps(handle, HOLDING_STEPS)
-        return max((float(np.linalg.norm(wrench[:3])) for wrench in steps), default=0.0)
+        sizes = np.array([(0.0, 0.0), *map(wrench_sizes, steps)])
+    return np.asarray(sizes.max(axis=0))
 
 
 TIPPED = 0.1
@@ -368,7 +370,7 @@ def loaded_handle(
     K and K_r are those of the law at the load (``law.secant_stiffness``). ``grip`` is the tool's
     pose (7,), ``load`` the wrench (6,) in N and N m, up to the levels.
     """
-    coupling, (force, torque) = parameters.coupling, _sizes(load)
+    coupling, (force, torque) = parameters.coupling, wrench_sizes(load)
     secant, (level, level_r) = source_of(secant_stiffness), parameters.levels_on_tool
     position = np.array(grip[:3]) + load[:3] / secant(Spring(coupling.stiffness, level), force)
     orientation, turn = np.array(grip[3:]), np.zeros(4)
@@ -380,8 +382,8 @@ def loaded_handle(
     return (*position.tolist(), *orientation.tolist())
 
 
-def _sizes(wrench: NDArray[np.float64]) -> tuple[float, float]:
-    """Returns the norms of a wrench's force and torque."""
+def wrench_sizes(wrench: NDArray[np.float64]) -> tuple[float, float]:
+    """Returns the norms of a wrench's force and torque, in N and N m."""
     return float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
 
 

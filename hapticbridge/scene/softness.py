@@ -14,7 +14,7 @@ from hapticbridge.kernel.jit import source_of
 from hapticbridge.kernel.restitution import rigid_restitution
 from hapticbridge.scene.contacts import MUJOCO_SOLREF, contact_numbers
 from hapticbridge.scene.treatment import SceneChange
-from hapticbridge.units import format_si
+from hapticbridge.units import format_number, format_si
 
 SOFT_FREQUENCY = 15.0
 """Natural frequency in Hz below which a constraint is meant as a spring. MuJoCo's default holds at
@@ -117,7 +117,7 @@ def _softened(springs: Sequence[_Springs]) -> Iterator[SceneChange]:
         numbers = [contact_numbers(ref, imp, 1.0, refsafe=False) for ref, imp in rows]
         frequency = np.sqrt([one.stiffness for one in numbers]) / (2.0 * math.pi)
         if named := _first(each, frequency < SOFT_FREQUENCY):
-            words = f"{named}: a spring of {frequency.min():.2g} Hz → rigid"
+            words = f"{named}: a spring of {format_number(frequency.min(), 2)} Hz → rigid"
             yield SceneChange(words, each.subject)
 
 

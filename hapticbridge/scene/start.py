@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from hapticbridge.scene.checks import NOTABLE_OVERLAP, Overlap, listed, overlaps
 from hapticbridge.scene.compile import reset
 from hapticbridge.scene.treatment import SceneChange
+from hapticbridge.units import format_count, format_degrees, format_number
 
 VIOLATION = 1e-4
 """Violation in m or rad above which a start is moved. Closed loops in published robots miss by
@@ -113,8 +114,8 @@ def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Sta
         words.append(f"start where {listed(closed)} → closed")
     limited = {row[1] for row, size in first.items() if row[0] == "joint" and size > VIOLATION}
     words += _moved(model, start, end, limited)
-    changes = tuple(SceneChange(each, "start") for each in _at_most(words, "parts of the scene"))
-    return Start(end if words else None, changes, _at_most(remaining, "constraints"))
+    changes = tuple(SceneChange(each, "start") for each in _at_most(words, "part", " of the scene"))
+    return Start(end if words else None, changes, _at_most(remaining, "constraint"))
 
 
 def _projected(trial: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
@@ -293,8 +294,8 @@ def _off(model: mujoco.MjModel, row: tuple[str, int], size: float) -> str:
 
 def _place(value: float, *, is_angle: bool) -> str:
     value = round(value, 8)  # finer is rounding
-    shown = float(f"{np.rad2deg(value) if is_angle else 1e3 * value:.3g}")
-    return f"{shown + 0.0:g} {'deg' if is_angle else 'mm'}"
+    value += 0.0  # without the sign of -0.0
+    return format_degrees(value) if is_angle else f"{format_number(1e3 * value, 3)} mm"
 
 
 def _moved(
@@ -332,7 +333,8 @@ def _moved(
     return words
 
 
-def _at_most(words: list[str], name: str) -> tuple[str, ...]:
+def _at_most(words: list[str], noun: str, of: str = "") -> tuple[str, ...]:
     """Returns the first of many sentences, and the number of the others."""
     more = len(words) - MAX_NAMED
-    return (*words[:MAX_NAMED], *([f"start of {more} more {name}: as these"] if more > 0 else []))
+    others = f"start of {format_count(more, f'more {noun}')}{of}: as these"
+    return (*words[:MAX_NAMED], *([others] if more > 0 else []))

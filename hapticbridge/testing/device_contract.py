@@ -42,6 +42,7 @@ from hapticbridge.device.base import AXES, JUMP_MARGIN, Device, DeviceInfo
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.kernel.tick_guard import FARTHEST
+from hapticbridge.units import format_number
 
 PERIOD, TICKS = 1e-3, 300
 """Period of the loop in s, and number of ticks in each run."""
@@ -206,15 +207,15 @@ def positions_are_in_metres(bench: _Bench) -> None:
     farthest, reach = np.linalg.norm(positions, axis=1).max(), info.reach or FARTHEST
     _require(
         farthest <= reach * (1.0 + 1e-9),  # rounding on a stop
-        f"a position is {farthest:.3g} m from the origin, farther than {reach:g} m: report metres, "
-        "or state the reach",
+        f"a position is {format_number(farthest, 3)} m from the origin, farther than {reach:g} m: "
+        "report metres, or state the reach",
     )
     ways = np.linalg.norm(positions[SPEED_TICKS:] - positions[:-SPEED_TICKS], axis=1)
     speed = float((ways / (times[SPEED_TICKS:] - times[:-SPEED_TICKS])).max())
     _require(
         speed <= JUMP_MARGIN * info.speed_limit or info.speed_limit == 0.0,
-        f"the device moves at {speed:.3g} m/s, over {JUMP_MARGIN:g} times its speed_limit of "
-        f"{info.speed_limit:g} m/s: report metres, or state its speed",
+        f"the device moves at {format_number(speed, 3)} m/s, over {JUMP_MARGIN:g} times its "
+        f"speed_limit of {info.speed_limit:g} m/s: report metres, or state its speed",
     )
 
 

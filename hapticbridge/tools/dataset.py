@@ -70,6 +70,7 @@ class Episode:
         names: Names of the k numbers, by name.
         states: ``qpos`` and ``qvel`` in a row, (n, nq + nv).
         pictures: PNG of each frame; none without a camera.
+        coupled: Names of those readings of sensors that include the coupling's pull on the tool.
     """
 
     name: str
@@ -78,6 +79,7 @@ class Episode:
     names: Mapping[str, tuple[str, ...]]
     states: NDArray[np.float64]
     pictures: tuple[bytes, ...] = field(repr=False)
+    coupled: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.states)
@@ -138,6 +140,7 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
         names=names,
         states=np.concatenate([found["qpos"], found["qvel"]], axis=1)[:-1],
         pictures=tuple(found["pictures"][:count]),
+        coupled=tuple(found["coupled_readings"]),
     )
 
 
@@ -446,12 +449,14 @@ class WrittenDataset:
         episodes: Number of frames of each episode.
         resets: Times in s within each episode at which the scene was reset, so that it jumps.
         ends: What ended each episode's run, as a clause; empty for an ordinary end.
+        coupled: Names of those readings of sensors that include the coupling's pull on the tool.
     """
 
     folder: Path
     episodes: tuple[int, ...]
     resets: tuple[tuple[float, ...], ...]
     ends: tuple[str, ...]
+    coupled: tuple[str, ...]
 
 
 def write_dataset(
@@ -491,7 +496,7 @@ def write_dataset(
     if folder.exists():
         raise RecordingError(f"'{folder}' exists; choose another folder")
     recordings = [_sound(open_recording(path)) for path in paths]
-    draft, counts = draft_of(folder), []
+    draft, counts, coupled = draft_of(folder), [], tuple[str, ...]()
     try:
         shutil.rmtree(draft, ignore_errors=True)
         draft.mkdir()
@@ -500,6 +505,7 @@ def write_dataset(
             for episode in _episodes(recordings, shot, progress):
                 writer.add(episode)
                 counts.append(len(episode))
+                coupled = episode.coupled
             writer.finish()
         draft.rename(folder)
     except OSError as error:
@@ -507,7 +513,8 @@ def write_dataset(
     finally:
         shutil.rmtree(draft, ignore_errors=True)
     ends = (unusual_end(Trip.among(each.events), each.events) for each in recordings)
-    return WrittenDataset(folder, tuple(counts), tuple(map(_resets, recordings)), tuple(ends))
+    resets = tuple(map(_resets, recordings))
+    return WrittenDataset(folder, tuple(counts), resets, tuple(ends), coupled)
 
 
 def _placings(recording: RecordingFile) -> list[Mapping[str, Any]]:

@@ -443,6 +443,7 @@ class _ColumnsWithSensors(TableColumns):
         self._sensors = sensors(recording.path)
         self.units |= {f"sensor_{name}": "MuJoCo's" for name in self._sensors.names}
         self.kinds += ["f"] * len(self._sensors.names)
+        self.coupled = tuple(f"sensor_{name}" for name in self._sensors.coupled)
 
     def values(self, ticks: NDArray[np.void]) -> list[NDArray[Any]]:
         """Returns the columns of some records, each contiguous, (n,), int64 or float64."""
@@ -465,12 +466,14 @@ class Exported:
         recording: The recording without its ticks.
         ticks: Count of rows in the table.
         events: Events that were written.
+        coupled: Columns of sensors whose readings include the coupling's pull on the tool.
     """
 
     files: tuple[Path, ...]
     recording: RecordingFile
     ticks: int
     events: tuple[dict[str, Any], ...]
+    coupled: tuple[str, ...] = ()
 
 
 def target_for(path: str | Path, form: str) -> Path:
@@ -547,7 +550,8 @@ def export(
         for written in drafts:
             with suppress(OSError):
                 written.unlink(missing_ok=True)
-    return Exported(files, recording, count, tuple(piece.events))
+    coupled = columns.coupled if isinstance(columns, _ColumnsWithSensors) else ()
+    return Exported(files, recording, count, tuple(piece.events), coupled)
 
 
 def time_of(event: Mapping[str, Any]) -> float:
