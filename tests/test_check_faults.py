@@ -836,6 +836,33 @@ def test_a_motor_whose_gain_grows_with_its_velocity_is_a_pump_under_some_control
     assert [told in f.sentence for f in found if f.kind == "pump"] == [True] * bool(told)
 
 
+CHANGED_AT = [
+    ('actuatorfrcrange="-1 1"', "", "scene.xml:3, joint 'turn'"),  # the only one
+    ('actuatorfrcrange="-1 1" ref="1"', "", "scene.xml:3, joint 'turn'"),
+    ('range="20 90" limited="true"', "", "scene.xml, key 'home'"),  # it starts beyond its limit
+    (
+        'range="20 90"',
+        '<keyframe><key name="home" qpos="0.1"/></keyframe>',
+        "scene.xml:5, key 'home'",
+    ),
+    ("", '<option><flag sleep="enable"/></option>', "scene.xml:5, <flag>"),
+]
+
+
+@pytest.mark.parametrize(("joint", "more", "place"), CHANGED_AT)
+def test_a_change_is_told_at_its_element_and_not_at_the_option(
+    tmp_path: Path, joint: str, more: str, place: str
+) -> None:
+    text = f"""<mujoco><option timestep="0.001" integrator="discrete" cone="elliptic"/>
+    <worldbody><body name="tool">
+    <joint name="turn" axis="0 1 0" {joint}/><geom size="0.01" pos="0.05 0 0" mass="0.1"/>
+    <site name="grip" pos="0.05 0 0"/></body></worldbody>
+    {more}</mujoco>"""
+    found = [fault for fault in faults_in(tmp_path, text) if fault.kind == "changed"]
+    assert place in {str(fault.place) for fault in found}
+    assert "<option>" not in {fault.place.element for fault in found}
+
+
 def test_a_tool_that_starts_in_a_height_field_is_told_to_start_outside(tmp_path: Path) -> None:
     """The advice, followed, ends the finding."""
     text = """<mujoco><option timestep="0.001" integrator="discrete" cone="elliptic"/><asset>

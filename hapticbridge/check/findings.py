@@ -61,7 +61,7 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         if change.subject not in ("time step", "integrator", "solver", "overlap"):
             yield Fault(
                 "changed",
-                places.option("integrator"),
+                places.setting(change.treatment.settings),
                 f"the scene runs with a change, {change}, because {change.treatment.why}",
                 _OF_SUBJECT.get(change.subject) or _instead(change.treatment),
             )
@@ -117,7 +117,7 @@ def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             "keyframe",
             place,
             f"the scene has keyframes ({listed}), but none is called '{START_KEYFRAME}': it starts "
-            "from the joints' zeros instead",
+            "at MuJoCo's initial pose instead",
             name if place.line else f"{own}: those of an attached model get a prefix",
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import PurePosixPath
@@ -12,6 +12,7 @@ import mujoco
 
 from hapticbridge.kernel.codes import PREFIX
 from hapticbridge.scene import SceneSource
+from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.source import Element, read_elements
 
 _TAGS = {
@@ -144,6 +145,28 @@ class Places:
     def flag(self) -> Place:
         """Returns the place of flags; MuJoCo takes one <flag> per <option>."""
         return self._first(("flag",), lambda _: True) or self.option("flag")
+
+    def setting(self, settings: Iterable[tuple[str, str]]) -> Place:
+        """Returns the only element that sets one of some attributes; else all that may.
+
+        Args:
+            settings: Pairs of element and attribute, as of a ``Treatment``. The attribute is empty
+                for an element that a run adds.
+        """
+        pairs = [(element.rpartition("/")[2], attribute) for element, attribute in settings]
+        tags = list(dict.fromkeys(tag for tag, _ in pairs))
+        if set(tags) <= {"option", "flag"}:
+            return self.option(pairs[0][1])
+        if tags == ["key"]:  # a run starts at no other
+            return self.named("key", START_KEYFRAME)
+        found = {
+            Place(file, element.line, _describe(element))
+            for file, elements in self._files
+            for element in elements
+            if any((element.tag, name) in pairs for name in element.attributes)
+        }
+        listed = ", ".join(f"<{tag}>" for tag in tags)
+        return found.pop() if len(found) == 1 else Place(self._main, 0, listed)
 
     def with_attribute(self, attribute: str) -> Place | None:
         """Returns the first element of any tag that has an attribute."""
