@@ -876,6 +876,22 @@ def test_a_tool_that_starts_in_a_height_field_is_told_to_start_outside(tmp_path:
     assert not any("start" in fault.sentence for fault in outside)
 
 
+def test_links_that_start_inside_each_other_are_told_to_be_excluded(tmp_path: Path) -> None:
+    """The advice, followed, ends the finding."""
+    text = """<mujoco><option timestep="0.001" integrator="discrete" cone="elliptic"/>
+    <worldbody><body name="a"><joint axis="0 1 0"/><geom size=".02" mass="0.1"/>
+    <body name="b" pos="0 0 .03"><joint axis="0 1 0"/><geom size=".001" mass="0.1"/>
+    <body name="c"><joint axis="0 1 0"/><geom size=".02" mass="0.1"/><site name="grip"/></body>
+    </body></body></worldbody>{}</mujoco>"""
+    found = faults_in(tmp_path, text.format(""))
+    told = [fault for fault in found if "<exclude>" in fault.change]
+    assert [fault.kind for fault in told] == ["changed"]
+    added = '<contact><exclude body1="a" body2="c"/></contact>'
+    assert not any(
+        "on → off" in fault.sentence for fault in faults_in(tmp_path, text.format(added))
+    )
+
+
 def test_a_size_for_too_many_rows_is_told_to_go_for_the_memory(tmp_path: Path) -> None:
     """The advice, followed, ends the finding; MuJoCo refuses the memory beside ``njmax``."""
     text = """<mujoco><size {}/><option timestep="0.001" integrator="discrete" cone="elliptic"/>

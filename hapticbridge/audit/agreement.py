@@ -136,13 +136,13 @@ def event_statements(recording: RecordingFile, timing: TimingTally) -> Iterator[
     """Yields what the records determine of the events."""
     events, count = recording.events, recording.count
     names = Counter(str(event.get("event")) for event in events)
-    yield Statement("number of events 'start'", names["start"], 1, "one run")
-    yield Statement("first event", events[0].get("event"), "start", "one run")
+    yield Statement("number of events 'start'", names["start"], 1, "the events of a run")
+    yield Statement("first event", events[0].get("event"), "start", "the events of a run")
     if recording.cut_sentence:  # records may be missing
         return
-    yield Statement("number of events 'stop'", names["stop"], 1, "one run")
+    yield Statement("number of events 'stop'", names["stop"], 1, "the events of a run")
     stop = events[-1]
-    yield Statement("last event", stop.get("event"), "stop", "one run")
+    yield Statement("last event", stop.get("event"), "stop", "the events of a run")
     for event in events:
         tick = event.get("tick")
         if type(tick) is not int or not 0 <= tick <= count:

@@ -76,6 +76,7 @@ side or its base, and not to the place that was meant."""
 
 _OF_SUBJECT = {
     "start": APART,
+    "nested parts": "an <exclude> of their bodies in the file's <contact>",
     "memory": "that memory in <size>, in place of njmax, nconmax and nstack",
 }
 """Ways to make a change in the file that is more than a new value."""
