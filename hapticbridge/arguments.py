@@ -8,7 +8,7 @@ request and the what-if are made from the same fields.
 from __future__ import annotations
 
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache
@@ -400,6 +400,19 @@ def _valid(kinds: Iterable[Any], own: Rule) -> str:
     return ", or ".join(found)
 
 
+def number_from(text: str, kind: Callable[[str], Any] = float) -> Any:
+    """Returns the number of a type, ``float`` or ``int``, that a text writes in plain notation.
+
+    Python also reads ``1_000`` and the digits of other scripts.
+
+    Raises:
+        ValueError: The text is none.
+    """
+    if "_" in text or not text.isascii():
+        raise ValueError(text)
+    return kind(text)
+
+
 def value_from(kind: Any, text: str, own: Rule = _NO_RULE) -> Any:
     """Returns the value of a field's type that a text writes; its range is not checked.
 
@@ -415,6 +428,6 @@ def value_from(kind: Any, text: str, own: Rule = _NO_RULE) -> Any:
             valid.append(f"one of {choices(get_args(member))}")
         elif member in (int, float, str, Path):
             with suppress(ValueError):
-                return member(text)
+                return number_from(text, member) if member in words else member(text)
             valid.append(words[member])
     raise ValueError(", or ".join(valid))

@@ -218,3 +218,24 @@ def test_the_defaults_of_a_command_are_valid(name: str) -> None:
         flag.path: flag.value(text_for(flag)) for flag in required if len(flag.path) == 1
     }
     check_fields(built(command, values))
+
+
+@pytest.mark.parametrize("text", ["\u0663", "\uff13", "1_0"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("run", "point_mass", "--duration", "{}"),
+        ("run", "point_mass", "--device", "simulated:damping={}"),
+        ("run", "point_mass", "--device", "simulated:delay={}"),
+        ("run", "point_mass", "--impact-pulses", "1", "--pulse", "{},20"),
+        ("run", "peg_in_hole", "--set", "clearance={}"),
+        ("run", "point_mass", "--grip", "mass@0,{},0"),
+        ("export", "run.mcap", "--format", "lerobot", "--fps", "{}"),
+    ],
+)
+def test_a_number_is_written_in_plain_notation(
+    call: Called, words: tuple[str, ...], text: str
+) -> None:
+    """Python reads these as 3, Arabic and full-width, and 10."""
+    code, _, told = call(*(word.format(text) for word in words))
+    assert (code, text in told) == (2, True)

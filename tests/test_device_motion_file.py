@@ -349,7 +349,7 @@ def table(steps: float, lengths: float, count: int = 30) -> str:
 MISTAKEN = [
     (table(1, 1e3), "spans 19.9 m .* if these are mm, divide them by 1000"),
     (table(1e3, 1e3), "rows 10 s apart, as times in ms have; .* if these are mm"),
-    (table(1e9, 1e3), r"rows 1e\+07 s apart, as times in ns have; .* if these are mm"),
+    (table(1e9, 1e3), r"rows 10000000 s apart, as times in ns have; .* if these are mm"),
     ("t_ms,x,y,z\n0,0,0,0\n1,0,0,0\n", "'t_ms' looks like ms; .* name the column t"),
     ("t,x_mm,y_mm,z_mm\n0,0,0,0\n1,0,0,0\n", "'x_mm' looks like mm; .* name the column x"),
 ]

@@ -159,6 +159,9 @@ def test_a_part_of_a_run_is_filmed_as_slowly_as_asked_for(sway: Path) -> None:
     ticks = list(film_ticks(stage, 30, start=0.1, stop=0.2, speed=0.1))
     assert len(ticks) == 30  # a tenth of a second in a whole one
     assert (ticks[0], ticks[3], ticks[-1]) == (99, 109, 196)
+    # a film of 0.25 s has frames at 0, 0.1 and 0.2 s
+    assert list(film_ticks(stage, 10, stop=0.25)) == [0, 99, 199]
+    assert list(film_ticks(stage, 10, stop=0.2)) == [0, 99]
     with pytest.raises(RecordingError, match=r"lasts from 0 to 0\.3"):
         next(film_ticks(stage, 30, stop=0.4))
     with pytest.raises(RecordingError, match=r"lasts from 0 to 0\.3"):
@@ -176,8 +179,8 @@ def test_film_has_a_frame_for_every_thirtieth_of_a_second(sway: Path, tmp_path: 
     facts = next(frames)
     assert facts["source_size"] == (160, 120)
     assert facts["fps"] == pytest.approx(30)
-    assert told[-1] == (9, 9)
-    assert sum(1 for _ in frames) == 9
+    assert told[-1] == (10, 10)  # the last one at 0.3 s of 0.301
+    assert sum(1 for _ in frames) == 10
 
 
 def test_animated_picture_has_a_frame_for_every_tenth_of_a_second(
@@ -187,7 +190,7 @@ def test_animated_picture_has_a_frame_for_every_tenth_of_a_second(
     draw(sway, film, Shot(width=160, height=120, fps=10))
     with Image.open(film) as picture:
         assert picture.size == (160, 120)
-        assert len(list(ImageSequence.Iterator(picture))) == 3
+        assert len(list(ImageSequence.Iterator(picture))) == 4
         assert picture.info["duration"] == 100
         assert picture.info["loop"] == 0
         picture.seek(0)

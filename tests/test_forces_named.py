@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,7 +19,14 @@ from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.page import head_facts
 from hapticbridge.run.options import Workspace
 from hapticbridge.run.summary import Summary
-from hapticbridge.units import format_forces, format_number, format_si, format_wrenches
+from hapticbridge.units import (
+    format_count,
+    format_degrees,
+    format_forces,
+    format_number,
+    format_si,
+    format_wrenches,
+)
 from hapticbridge.view.replay import Replay
 
 Called = Callable[..., tuple[int, str, str]]
@@ -134,6 +142,21 @@ def test_a_number_has_three_digits_and_the_prefix_that_fits(value: float, text: 
 )
 def test_a_large_number_has_no_exponent(value: float, digits: int, text: str) -> None:
     assert format_number(value, digits) == text
+
+
+def test_an_angle_and_a_number_of_things_are_written_as_they_are_read() -> None:
+    assert [format_degrees(each, 2) for each in (2.43, 2.0 * np.pi)] == ["140 deg", "360 deg"]
+    assert [format_count(each, "pair") for each in (1, 2)] == ["1 pair", "2 pairs"]
+
+
+def test_sentences_on_fast_loops_have_no_exponents(call: Called) -> None:
+    _, out, _ = call("check", "point_mass", "--rate", 20000)
+    assert "20000 Hz" in out
+    assert not re.search(r"\de\+\d", out)
+    asked = ("run", "point_mass", "--fast", "--duration", 0.05, "--rate", 20000)
+    _, out, err = call(*asked, "--scene-rate", 10000)
+    assert "the scene steps at 10000 Hz" in err
+    assert not re.search(r"\de\+\d", out + err)
 
 
 def test_a_stiff_coupling_is_printed_as_it_is_typed(call: Called) -> None:

@@ -20,8 +20,10 @@ from typing import IO, Any
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
@@ -39,7 +41,7 @@ from hapticbridge.recording import (
     repair,
 )
 from hapticbridge.recording import format as layout
-from hapticbridge.recording.container import DamageError, Fields
+from hapticbridge.recording.container import MAGIC, Block, Container, DamageError, Fields, FileBytes
 from hapticbridge.recording.writer import RESERVE, ChunkIndexFile
 
 
@@ -596,3 +598,19 @@ def test_chunk_that_claims_exabytes_is_not_allocated(whole: Path, tmp_path: Path
     data = bytearray(whole.read_bytes())
     struct.pack_into("<Q", data, chunks(whole)[0][0] + 9 + 16, 1 << 60)
     assert any("is not read" in problem for problem in changed(tmp_path / "a.mcap", data).problems)
+
+
+@pytest.mark.parametrize("states_size", [True, False])
+def test_an_empty_chunk_is_no_damage(tmp_path: Path, *, states_size: bool) -> None:
+    """A frame of Zstandard may leave out the size of its content."""
+    packed = zstandard.ZstdCompressor(write_content_size=states_size).compress(b"")
+    chunk = struct.pack("<QQQII4sQ", 0, 0, 0, 0, 4, b"zstd", len(packed)) + packed
+    end = struct.pack("<BQI", Opcode.DATA_END, 4, 0)
+    end += struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0)
+    path = tmp_path / "empty.mcap"
+    path.write_bytes(MAGIC + struct.pack("<BQ", Opcode.CHUNK, len(chunk)) + chunk + end + MAGIC)
+    with FileBytes(path) as data:
+        container = Container(data)
+        (block,) = container.records()
+    assert isinstance(block, Block)
+    assert (container.problems, block.data) == ([], b"")

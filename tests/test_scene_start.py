@@ -429,3 +429,19 @@ def test_a_constraint_of_a_flex_has_a_name(tmp_path: Path) -> None:
     model = load_scene(scene_file(tmp_path, scene_text(rope))).model
     (equality,) = np.flatnonzero(model.eq_type == int(mujoco.mjtEq.mjEQ_FLEX))
     assert row_name(model, ("equality", int(equality))).startswith("equality '")
+
+
+@pytest.mark.parametrize(("count", "words"), [(5, "1 more part of"), (6, "2 more parts of")])
+def test_the_last_parts_that_start_elsewhere_are_counted(
+    tmp_path: Path, count: int, words: str
+) -> None:
+    doors = "".join(
+        f'<body pos="{each} 0 1"><joint axis="0 0 1" range="20 40" limited="true"/>'
+        '<geom pos="0.1 0 0" size="0.02" mass="0.1"/></body>'
+        for each in range(1, count + 1)
+    )
+    tool = '<body name="tool"><freejoint/><geom size="0.02" mass="0.1"/><site name="grip"/></body>'
+    (tmp_path / "doors.xml").write_text(f"<mujoco><worldbody>{tool}{doors}</worldbody></mujoco>")
+    changes = load_scene(tmp_path / "doors.xml").changes
+    assert sum("0 deg → 20 deg" in change for change in changes) == 4
+    assert f"start of {words} the scene: as these" in changes[-1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from hapticbridge.arguments import shown
+from hapticbridge.arguments import number_from, shown
 from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.kernel.impact_pulse import largest_pulse
 from hapticbridge.kernel.jit import source_of
@@ -37,7 +37,7 @@ def pulse_of(text: str, rate: float, source: str = "") -> tuple[float, float]:
     """
     most = 0.5 * rate
     try:
-        frequency, decay = (float(part) for part in text.split(","))
+        frequency, decay = (number_from(part) for part in text.split(","))
     except ValueError:
         frequency = decay = math.nan
     frequency, decay = PULSES.get(text, (frequency, 1e-3 * decay))

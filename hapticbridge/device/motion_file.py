@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from zstandard import ZstdError
 
+from hapticbridge.arguments import number_from
 from hapticbridge.device.base import USUAL_SPEED_LIMIT
 from hapticbridge.device.trajectory import (
     ORIENTATION,
@@ -74,7 +75,7 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
                 f"{width} columns"
             )
         try:
-            values.extend([_value(fields[column]) for column in columns])
+            values.extend([number_from(fields[column]) for column in columns])
         except ValueError:
             column = next(i for i in columns if not _is_number(fields[i]))
             raise DeviceError(
@@ -159,20 +160,9 @@ def _column_names(where: str, line: str) -> list[str]:
     return names
 
 
-def _value(text: str) -> float:
-    """Returns a number in plain notation; Python also reads ``0_1`` and other scripts' digits.
-
-    Raises:
-        ValueError: The text is none.
-    """
-    if "_" in text or not text.isascii():
-        raise ValueError(text)
-    return float(text)
-
-
 def _is_number(text: str) -> bool:
     try:
-        _value(text)
+        number_from(text)
     except ValueError:
         return False
     return True

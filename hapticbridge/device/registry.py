@@ -26,6 +26,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
+from hapticbridge.arguments import number_from
 from hapticbridge.device.base import Device, DeviceInfo, calling_on_error, checked_close, telling
 from hapticbridge.device.driver import Driver, FoundDevice, Notify, Options, ignore_message
 from hapticbridge.device.motion_file import is_bag, read_bag, read_motion
@@ -202,10 +203,12 @@ def parsed(device: str, text: str, valid: Options, first: str = "") -> dict[str,
         else:
             value, _, text = text.partition(",")
         try:
-            values[name] = kind(value.strip())
+            written = value.strip()
+            is_number = kind in (int, float)
+            values[name] = number_from(written, kind) if is_number else kind(written)
         except ValueError:
             number = "a whole number" if kind is int else "a number"
-            raise DeviceError(f"{name} is '{value.strip()}'; it must be {number}") from None
+            raise DeviceError(f"{name} is '{written}'; it must be {number}") from None
     return values
 
 
@@ -252,7 +255,7 @@ _STATED_OPTIONS = tuple(
 
 def _stated(text: str) -> float | None:
     """Returns a value of a data sheet; None for ``unknown``."""
-    return None if text == "unknown" else float(text)
+    return None if text == "unknown" else number_from(text)
 
 
 _SIMULATED_OPTIONS: Options = {

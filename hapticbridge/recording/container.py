@@ -432,6 +432,7 @@ def _decompressed(compression: str, packed: bytes, size: int) -> bytes:
         # zstandard allocates the size that the frame header claims
         if zstandard.frame_content_size(packed) not in (-1, size):
             raise DamageError("its size does not match")
-        return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+        # 0 would mean the size in the frame header, which may be left out
+        return zstandard.ZstdDecompressor().decompress(packed, max_output_size=max(size, 1))
     except (zstandard.ZstdError, RuntimeError) as error:  # of lz4
         raise DamageError("it does not decompress") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import limit_words
 from hapticbridge.kernel.codes import held_body
-from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.parameters import ROUNDING, RunParameters
 from hapticbridge.kernel.record import Timeline, force_on_hand
 from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
@@ -498,7 +499,8 @@ def film_ticks(
     """
     end = stage.duration if stop is None else stop
     stage.tick_at(end), stage.tick_at(start)  # refuse before the first frame
-    for frame in range(max(1, int((end - start) / speed * rate))):
+    count = math.ceil((end - start) / speed * rate - ROUNDING)  # all that begin before the end
+    for frame in range(max(1, count)):
         yield stage.tick_at(start + frame * speed / rate)
 
 

@@ -21,6 +21,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.arguments import number_from
 from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.codes import Grip
 from hapticbridge.scene.compile import reset, unfused_model
@@ -208,7 +209,7 @@ def _check_joint(spec: mujoco.MjSpec, name: str) -> None:
 
 def _point_of(grip: str, text: str) -> list[float]:
     try:
-        point = [float(number) for number in text.split(",")]
+        point = [number_from(number) for number in text.split(",")]
     except ValueError:
         point = []
     if len(point) != 3 or not all(map(math.isfinite, point)):

@@ -15,6 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from hapticbridge.arguments import number_from
 from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.mujoco_c import copy_of
 
@@ -268,7 +269,7 @@ def settings_from(words: Iterable[str]) -> dict[str, float]:
     for word in words:
         name, sign, number = word.partition("=")
         try:
-            value = float(number)
+            value = number_from(number)
         except ValueError:
             sign, value = "", math.nan
         if not (name and sign) or name in TAKEN:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import Field, dataclass, fields, replace
 from typing import Any
 
-from hapticbridge.arguments import rule_of, shown, types_of, value_from
+from hapticbridge.arguments import number_from, rule_of, shown, types_of, value_from
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.methods import SCENE, Method, method_named
@@ -274,7 +274,7 @@ def _converted(name: str, value: Value, kind: Any, field: Field[Any]) -> Any:
 def _number(name: str, value: Value) -> float:
     """Returns the value of a scene's parameter, whose range the scene checks."""
     try:
-        return float(value)
+        return number_from(value) if isinstance(value, str) else float(value)
     except (TypeError, ValueError):
         raise RecordingError(f"{name} is {shown(value)}; it must be a number") from None
 
