@@ -230,6 +230,43 @@ def test_two_bodies_part_with_e_of_their_approach_and_keep_their_momentum() -> N
     assert 0.05 * ends[0] + 0.2 * ends[1] == pytest.approx(0.05 * 1.5 - 0.2 * 0.5)
 
 
+SKIMMING = """<geom type="plane" size="50 50 .1"/>
+  <body name="ball" pos="0 0 0.0213"><freejoint name="ball"/>
+    <geom size="0.02" mass="0.05"/></body>"""
+
+
+@pytest.mark.parametrize("damping", [0.05, 0.5])
+@pytest.mark.parametrize(("friction", "slide"), [(0.4, 3.0), (0.6, 3.0), (1.0, 3.0), (1.0, 8.0)])
+def test_a_ball_that_skims_the_ground_rebounds_with_its_whole_e(
+    friction: float, slide: float, damping: float
+) -> None:
+    """Friction turns a ball and slows it, and does not lift it."""
+    e, inertia = e_of(damping), 0.4
+    start = np.array([slide, 0.0, -1.0, 0.0, 0.0, 0.0])
+    run = started(scene(SKIMMING, damping, friction=friction), {"ball": start})
+    end = followed(run, at_rest(4), lambda d: d.joint("ball").qvel[2])[-1]
+    assert end == pytest.approx(e, rel=5e-3)
+    stopped = min(friction * (1.0 + e), slide / (1.0 + 1.0 / inertia))  # slides on, or rolls
+    assert run.scene.data.joint("ball").qvel[0] == pytest.approx(slide - stopped, abs=0.01)
+    assert strict(run)
+
+
+@pytest.mark.parametrize(("torsion", "spin"), [(0.005, 100.0), (0.01, 10.0), (0.02, 300.0)])
+def test_a_ball_that_spins_about_the_normal_rebounds_with_its_whole_e(
+    torsion: float, spin: float
+) -> None:
+    e = e_of(0.2)
+    start = np.array([0.0, 0.0, -1.0, 0.0, 0.0, spin])
+    wanted = f'friction="0.3 {torsion} 0" condim="4"'
+    xml = scene(SKIMMING, 0.2).replace('friction="0.0 0 0"', wanted)
+    run = started(xml, {"ball": start})
+    end = followed(run, at_rest(4), lambda d: d.joint("ball").qvel[2])[-1]
+    assert end == pytest.approx(e, rel=5e-3)
+    slowed = torsion * (1.0 + e) / (0.4 * 0.02**2)
+    assert run.scene.data.joint("ball").qvel[5] == pytest.approx(max(spin - slowed, 0.0), abs=0.5)
+    assert strict(run)
+
+
 # Energy
 
 ROD = """<geom type="plane" size="5 5 .1"/>
@@ -312,6 +349,32 @@ def test_random_rods_have_the_smaller_of_newtons_and_poissons_rebound() -> None:
     assert max(created) < 0.0
     assert len(errors) > 40
     assert max(errors) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("mass", "friction_loss", "e"),
+    [(1.0, 300.0, 0.9), (1.0, 300.0, 0.98), (2.0, 300.0, 0.9), (5.0, 50.0, 0.98)],
+)
+def test_a_joint_with_dry_friction_gains_nothing_in_a_blow(
+    mass: float, friction_loss: float, e: float
+) -> None:
+    """MuJoCo's friction drags a body on that a blow has slowed, by 17 to 130 mJ here."""
+    bodies = f"""<body name="one" pos="-0.0205 0 0">
+        <joint name="one" type="slide" axis="1 0 0" frictionloss="{friction_loss}"/>
+        <geom size="0.02" mass="{mass}"/></body>
+      <body name="two" pos="0.02 0 0"><joint name="two" type="slide" axis="1 0 0"/>
+        <geom size="0.02" mass="1"/></body>"""
+    run = started(scene(bodies, damping_of(e)), {"one": 1.0})
+    run.binding.state["contact"]["cap"] = 0.0  # nothing that was burned before pays
+    energies = [0.5 * mass]
+
+    def note(_: int, data: mujoco.MjData) -> None:
+        one, two = data.joint("one").qvel[0], data.joint("two").qvel[0]
+        energies.append(0.5 * (mass * one**2 + two**2))
+
+    go_on(run, at_rest(3), after_tick=note)
+    assert run.scene.data.joint("two").qvel[0] > 0.3  # it was struck
+    assert np.diff(energies).max() < 0.0
 
 
 # Behind the coupling

@@ -104,6 +104,30 @@ def test_a_hand_that_trembles_across_half_a_turn_gains_nothing(
         assert in_scene(hand, late, **how, change=passes_half_a_turn) > 10.0
 
 
+def crosses(step: float) -> Path:
+    """A hand that goes to and fro from ``LARGEST_TWIST`` on, by ``step`` rad in every tick."""
+
+    def place(tick: NDArray[np.float64]) -> NDArray[np.float64]:
+        away = np.where((tick > BEGIN) & ((tick - BEGIN) % 2 == 1.0), step, 0.0)
+        return LARGEST_TWIST * np.clip(tick / BEGIN, 0.0, 1.0) + away
+
+    def path(time: NDArray[np.float64]) -> Rotation:
+        tick = np.floor(time)
+        way = place(tick) + (time - tick) * (place(tick + 1.0) - place(tick))
+        return Rotation.from_rotvec(np.outer(way, (0.0, 0.0, 1.0)))
+
+    return path
+
+
+@pytest.mark.parametrize("scene_ticks", [1, 10])
+@pytest.mark.parametrize("step", [0.66, 0.8, 1.15])
+def test_a_hand_that_turns_across_half_a_turn_in_a_tick_gains_nothing(
+    step: float, scene_ticks: int
+) -> None:
+    """The guard lets it turn so fast below 470 Hz. It had 112 to 381 J from nowhere."""
+    assert in_scene(crosses(step), 1.0, scene_ticks=scene_ticks) < NOTHING
+
+
 def test_a_tool_that_spins_gains_nothing_at_half_a_turn() -> None:
     """The midpoint torque did work there, in time too, and its spring held no less."""
     still = trembles(0.0, 0.0, 1)

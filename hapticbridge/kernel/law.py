@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.codes import Part, Scheme, State
 from hapticbridge.kernel.handle import (
+    UPRIGHT,
     device_from_scene,
     scene_from_device,
     slip_handle,
@@ -99,7 +100,8 @@ N m s/rad, seen at the tool, is the damping that pays for a torque across the mo
 LARGEST_TWIST, STOPPED_TWIST = 2.5, 2.8
 """Twist in rad from which the handle slips that a hand holds behind a late device, or in a run that
 is not stopped at the second. They leave 0.64 and 0.34 rad for the turns of one tick to half a turn,
-where the torque reverses. Larger ones leave less."""
+where the torque reverses. Larger ones leave less. A hand that turns farther slips as if it had not
+come across."""
 
 _GAINS = 10  # numbers per actuator in actuator_gainprm and actuator_biasprm (mjNGAIN, mjNBIAS)
 
@@ -650,6 +652,22 @@ def felt(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
 
 
 @compiled
+def _unwound(s: State, twist: Vector) -> Vector:
+    """Returns a twist in rad that goes on beyond half a turn, where the handle has turned across.
+
+    Otherwise the handle would slip to ``LARGEST_TWIST`` on the other side, where the torque is
+    reversed: a hand that goes to and fro by δ behind a torque a tick late gets 2.5 K_r δ − b_r δ²/T
+    each time, for δ from 0.64 rad on.
+    """
+    size, share = norm(twist), 1.0 / s.run.law_evaluations
+    if size <= LARGEST_TWIST:
+        return twist
+    back = quaternion_exp(scaled(-share, vector_of(s.pose.handle_turn)))
+    before = rotation_between(UPRIGHT, product(back, quaternion_exp(twist)))
+    return scaled(1.0 - 2.0 * math.pi / size, twist) if dot(before, twist) < 0.0 else twist
+
+
+@compiled
 def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     """Slips the handle toward the tool, where the spring holds more than it may.
 
@@ -681,7 +699,7 @@ def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     linear, angular = springs(s)
     stretch, twist = pulled(s)
     if s.guard.has_hand and (k.late_ticks > 0 or s.guard.max_angle > STOPPED_TWIST):
-        max_twist = min(max_twist, LARGEST_TWIST)
+        max_twist, twist = min(max_twist, LARGEST_TWIST), _unwound(s, twist)
     if k.owed[0] > 0.0 or k.owed[1] > 0.0:
         length, k.owed[0] = _paid(linear, norm(stretch), k.owed[0])
         angle, k.owed[1] = _paid(angular, norm(twist), k.owed[1])

@@ -12,7 +12,8 @@ rebound w is e times the speed at the surface, taken to the place where the step
 (``rebound_speed``); forces that press in the step count as in a flight, constraints do not. Of a
 mocap body's move, δ/h is part of v_n and comes off ŵ again. The lift of sliding is subtracted as
 ever. A step is repeated up to three times for an error of its rebounds beyond ``REBOUND_ERROR``,
-and as often for the impulses; what is left then, stays.
+and as often for the impulses; what is left then, stays. The sliding that a blow leaves is foreseen
+by the friction of the last solution: a ball that skims the ground leaves it with its whole e.
 
 That is Newton's rule where no friction couples normal and sliding, and elsewhere the smaller of
 Newton's and Poisson's rebound. Newton's alone may create energy: 0.041 J with a rod of 1 kg that
@@ -24,7 +25,8 @@ is judged. Its energy is, with C given by the rows and the remainder r,
 
 A step with a blow is kept if C <= (share of the tank) + ``PAID`` ½‖v⁺ − v‖²_M. Then E_k is at most
 what the tank holds, plus r − (1 − ``PAID``) ½‖v⁺ − v‖²_M. Otherwise it is repeated with a smaller
-ρ, at last 0, which is the law without a blow. This needs no property of geometry or friction.
+ρ, at last 0, which is the law without a blow. This needs no property of geometry or friction. What
+friction losses of joints give counts in C: MuJoCo aims them at a share of v, and not of v⁺.
 Without friction and other forces, C/(½‖v⁺ − v‖²_M) = 2e/(1 + e). Of a resting body, blows end.
 
 One ρ holds for all blows of a step. A chain of bodies that touch passes a blow on as if they were

@@ -400,6 +400,7 @@ def _aim(s: State) -> None:
     ends = floats(s.contact.end_velocity, MAX_ROWS)
     blocked = floats(s.contact.blocked, MAX_ROWS)
     contacts = pointer_at(mj.contact)
+    has_ends = s.contact.corrections > 0 or s.contact.blow_stage == RESTITUTION
     s.contact.lift = 0.0
     for c in range(ints(mj.ncon, 1)[0]):
         contact = contacts + c * mj.contact_size
@@ -407,11 +408,7 @@ def _aim(s: State) -> None:
         if row < 0:
             continue
         friction = floats(contact + mj.contact_friction, 5)
-        slide, rest = 0.0, 0.0
-        for j in range(1, ints(contact + mj.contact_dim, 1)[0]):
-            slide += (friction[j - 1] * velocities[row + j]) ** 2
-            if s.contact.corrections > 0:
-                rest += (friction[j - 1] * ends[row + j]) ** 2
+        slide, rest, along = _slides(s, contact, has_ends)
         distance = opening(s, contact)
         wanted = (-push if distance < 0.0 else -1.0) * distance / h
         opened = opened_by_mocap(s, contact) if s.energy.mocap_has_moved else 0.0
@@ -421,8 +418,11 @@ def _aim(s: State) -> None:
             wanted = max(wanted, _softened(rebound - opened / h, velocities[row]))
         stop = max(wanted - velocities[row], 0.0)
         lift = max(math.sqrt(slide) - friction[0] ** 2 * stop, 0.0)
-        if s.contact.corrections > 0:
-            lift = math.sqrt(rest) if rebound >= 0.0 else min(lift, math.sqrt(rest))
+        if rebound >= 0.0 and has_ends:
+            change = rebound - opened / h - velocities[row], ends[row] - velocities[row]
+            lift = _slide_left(slide, rest, along, change)
+        elif s.contact.corrections > 0:
+            lift = min(lift, math.sqrt(rest))
         solimp, d = floats(contact + mj.contact_solimp, 2), _IMPEDANCE
         if row < MAX_ROWS and blocked[row] >= 0.0:
             slip = math.sqrt(rest if s.contact.corrections > 0 else slide)
@@ -438,6 +438,42 @@ def _aim(s: State) -> None:
         solref = floats(contact + mj.contact_solreffriction, 2)
         solref[0], solref[1] = 0.0, -d / (_EXACT * h)
         solimp[0] = solimp[1] = d
+
+
+@compiled
+def _slides(s: State, contact: int, has_ends: bool) -> tuple[float, float, float]:
+    """Returns (μ|v_t|)² and, of the last solution, (μ|v_t⁺|)² and μ² v_t·v_t⁺, in m²/s²."""
+    row, dim = ints(contact + s.mj.contact_row, 1)[0], ints(contact + s.mj.contact_dim, 1)[0]
+    velocities = floats(pointer_at(s.mj.efc_vel), row + dim)
+    ends = floats(s.contact.end_velocity, MAX_ROWS)
+    friction = floats(contact + s.mj.contact_friction, 5)
+    start = end = along = 0.0
+    for j in range(1, dim):
+        start += (friction[j - 1] * velocities[row + j]) ** 2
+        if has_ends:
+            end += (friction[j - 1] * ends[row + j]) ** 2
+            along += friction[j - 1] ** 2 * velocities[row + j] * ends[row + j]
+    return start, end, along
+
+
+@compiled
+def _slide_left(start: float, end: float, along: float, change: tuple[float, float]) -> float:
+    """Returns the μ|v_t⁺| in m/s that a blow leaves, by the friction of its last solution.
+
+    The impulse that changes v_n slows the sliding in proportion, while it goes on in its direction.
+    Otherwise each repetition would keep κ/(1 + κ) of the error, κ = μ² J_t M⁻¹ J_tᵀ/(J_n M⁻¹ J_nᵀ):
+    0.78 of a ball's at μ = 1.
+
+    Args:
+        start: (μ|v_t|)² in m²/s², as of ``_slides``.
+        end: (μ|v_t⁺|)² of the last solution.
+        along: μ² v_t·v_t⁺ of the last solution.
+        change: Change of v_n in m/s that is wanted, and that of the last solution.
+    """
+    left = math.sqrt(end)
+    if along <= 0.0 or change[1] <= 0.0:
+        return left
+    return max(left - max(math.sqrt(start) - left, 0.0) * (change[0] / change[1] - 1.0), 0.0)
 
 
 @compiled
@@ -723,6 +759,7 @@ def _begin_restitution(s: State) -> None:
         floats(contact.approaches, count),
         floats(pointer_at(mj.efc_force), count),
     )
+    note_ends(s)
     mj_mul_jac(mj.model, mj.data, contact.pressings, contact.qacc_smooth)
     contact.blow_stage = contact.corrections = contact.cuts = 0
     for row in range(count):
@@ -844,7 +881,11 @@ def _spendable(s: State) -> float:
 
 @compiled
 def returned_energy(s: State) -> float:
-    """Returns C, the energy in J that rigid constraints gave in the step that just ended."""
+    """Returns C, the energy in J that rigid constraints gave in the step that just ended.
+
+    In a blow, what friction losses of joints and tendons gave counts, too: MuJoCo aims them at a
+    share of the velocity at the start, which the blow has reversed or slowed.
+    """
     mj, h = s.mj, s.run.timestep
     count = ints(mj.nefc, 1)[0]
     force = floats(pointer_at(mj.efc_force), count)
@@ -857,6 +898,9 @@ def returned_energy(s: State) -> float:
         if kinds[i] > LIMIT_TENDON or _is_held(s, kinds[i], ids[i]):
             end = velocities[i] + h * (reference[i] - regularisation[i] * force[i])
             total += h * force[i] * end
+        elif s.contact.blow_stage == RESTITUTION and kinds[i] != EQUALITY:
+            end = velocities[i] + h * (reference[i] - regularisation[i] * force[i])
+            total += max(h * force[i] * end, 0.0)
     return total
 
 
@@ -905,6 +949,7 @@ def _has_sunk(s: State) -> bool:
     note_ends(s)
     ends, contacts = floats(contact.end_velocity, count), pointer_at(mj.contact)
     force = floats(pointer_at(mj.efc_force), count)
+    approaches, e = floats(contact.approaches, count), floats(contact.restitutions, count)
     for c in range(ints(mj.ncon, 1)[0]):
         one = contacts + c * mj.contact_size
         row = ints(one + mj.contact_row, 1)[0]
@@ -912,7 +957,9 @@ def _has_sunk(s: State) -> bool:
             continue
         rebound = _rebound(s, row)
         if rebound >= 0.0:
-            speed = rebound if rebound > 0.0 else floats(contact.approaches, row + 1)[row]
+            speed = rebound
+            if rebound == 0.0:  # the impulse of the compression bounds the rebound to come
+                speed = e[row] * approaches[row]
             if s.energy.mocap_has_moved:
                 rebound -= opened_by_mocap(s, one) / h
             error = abs(ends[row] - rebound) if force[row] > 0.0 else rebound - ends[row]
