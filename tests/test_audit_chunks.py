@@ -203,7 +203,7 @@ def test_chunks_as_large_as_other_programs_write_them_are_read(run: Path, tmp_pa
 
 
 DAMAGED: dict[str, tuple[Callable[[bytes], bytes], str, str]] = {
-    "cut": (lambda data: lz4.frame.compress(data)[:-40], "lz4", "its checksum does not match"),
+    "cut": (lambda data: lz4.frame.compress(data)[:-40], "lz4", "bytes and states"),
     "torn": (lambda data: lz4.frame.compress(data)[9:], "lz4", "it does not decompress"),
     "unknown": (lambda data: data, "br", "'br' is not one of 'lz4', 'zstd' and none"),
 }

@@ -13,6 +13,7 @@ import struct
 import sys
 import tempfile
 import tracemalloc
+import zlib
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -614,3 +615,28 @@ def test_an_empty_chunk_is_no_damage(tmp_path: Path, *, states_size: bool) -> No
         (block,) = container.records()
     assert isinstance(block, Block)
     assert (container.problems, block.data) == ([], b"")
+
+
+@pytest.mark.parametrize(
+    ("size", "crc", "fault"),
+    [
+        (4, zlib.crc32(b"tick"), ""),
+        (4, 0, ""),
+        (4, 1, "its checksum does not match"),
+        (5, 0, "it has 4 bytes and states 5"),
+    ],
+)
+def test_a_chunk_without_a_checksum_is_no_damage(
+    tmp_path: Path, size: int, crc: int, fault: str
+) -> None:
+    """MCAP writes 0 where none was computed."""
+    path = tmp_path / "chunk.mcap"
+    chunk = struct.pack("<QQQII0sQ", 0, 0, size, crc, 0, b"", 4) + b"tick"
+    end = struct.pack("<BQI", Opcode.DATA_END, 4, 0)
+    end += struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0)
+    path.write_bytes(MAGIC + struct.pack("<BQ", Opcode.CHUNK, len(chunk)) + chunk + end + MAGIC)
+    with FileBytes(path) as data:
+        container = Container(data)
+        (block,) = container.records()
+    assert isinstance(block, Block)
+    assert (block.fault, block.data) == (fault, b"tick")
