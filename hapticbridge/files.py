@@ -14,7 +14,7 @@ import shutil
 import sys
 import tempfile
 import zlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -190,6 +190,19 @@ def encoding_words() -> str:
     encoding = sys.getfilesystemencoding()
     return f"Python reads names as {encoding} here; set PYTHONUTF8=1, or a locale with UTF-8"
 
+
+def user_folder(find: Callable[..., str]) -> Path | None:
+    """Returns this program's folder by a function of platformdirs; None without a home directory.
+
+    A user without an entry in the system's list has one only if HOME is set.
+    """
+    with suppress(RuntimeError):  # of newer versions; an older one returns a relative '~'
+        if (folder := Path(find("hapticbridge", appauthor=False))).is_absolute():
+            return folder
+    return None
+
+
+NO_HOME = "this user has no home directory; set HOME"
 
 # Files of other programs
 

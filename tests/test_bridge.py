@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ import hapticbridge as hb
 from hapticbridge.audit import audit
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.demand.guard import Limits
+from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip, SceneError
 from hapticbridge.kernel.record import CLOCK_FIELDS
 from hapticbridge.recording import read_recording
@@ -267,8 +269,13 @@ def test_a_keyword_that_is_no_option_is_refused_in_a_sentence(name: str, message
 
 
 def test_what_is_no_scene_device_or_clock_is_refused_in_a_sentence() -> None:
-    with pytest.raises(DeviceError, match=r"device is None; it must be a string such as"):
+    with pytest.raises(DeviceError, match=r"device is None, which has no DeviceInfo as info; it"):
         Bridge("point_mass", None)  # type: ignore[arg-type]
+    with pytest.raises(DeviceError, match=r"device is .*, which is a class, and no object of it; "):
+        Bridge("point_mass", SimulatedDevice)  # type: ignore[arg-type]
+    lame = SimpleNamespace(info=SimulatedDevice().info, start=len, read=len)
+    with pytest.raises(DeviceError, match=r"device is .*, which lacks write, close; it must be"):
+        Bridge("point_mass", lame)
     with pytest.raises(HapticBridgeError, match=r"clock is the class .*; .*: SimulatedClock\(\)"):
         Bridge("point_mass", clock=SimulatedClock)  # type: ignore[arg-type]
     for source in (None, 5):

@@ -161,7 +161,7 @@ OTHER = "[FoundDevice(driver='x', name='x', serial='', path='', transport='hid')
         ("devices", "find", OTHER, "it must list FoundDevice with the driver 'rail'"),
         ("devices", "medium", "1 / 0", "rail: medium failed with ZeroDivisionError"),
         ("run", "open", "1 / 0", "rail: open failed with ZeroDivisionError"),
-        ("run", "open", "None", "open failed with TypeError: it must return a device with a"),
+        ("run", "open", "None", "open failed with TypeError: it must return a device, and what"),
         ("run", "start", "1 / 0", "device 'rail': start failed with ZeroDivisionError"),
         ("run", "start", "np.zeros(3)", "start returned array([0., 0., 0.]); it must be an array"),
         ("run", "close", "1 / 0", "device 'rail': close failed with ZeroDivisionError"),

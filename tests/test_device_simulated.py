@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 import hapticbridge as hb
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice, device_for
+from hapticbridge.device.simulated.device import hand_for
 from hapticbridge.device.trajectory import lissajous
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.record import SAMPLE_DTYPE
@@ -532,3 +533,27 @@ def test_hand_is_firm_enough_to_lift_the_tool(
                 highest = max(highest, float(scene.data.body("mug").xpos[2]) - 0.05)
         lifted.append(highest > 1e-3)
     assert lifted == [True, False]
+
+
+def test_a_hand_bears_the_whole_weight_of_a_tool_beside_its_centre_of_mass(tmp_path: Path) -> None:
+    """3 N, 0.12 m from the grip, hang on the hand although the tool could turn: 3 N/5 mm."""
+    path = tmp_path / "mallet.xml"
+    path.write_text(
+        """<mujoco><option gravity="0 0 -10"/><worldbody><body name="mallet"><freejoint/>
+        <geom size=".02" pos=".12 0 0" mass=".3"/><site name="grip"/></body></worldbody></mujoco>"""
+    )
+    assert hand_for(load_scene(path)).stiffness == pytest.approx(600.0, rel=1e-6)
+
+
+def test_a_hand_holds_a_hinged_bar_by_force_and_turn_as_its_springs_share_them(
+    tmp_path: Path,
+) -> None:
+    """K r and K_r bear the torque of 12 N m at r = 2 m together: f = 12 r/(r² + K_r/K)."""
+    path = tmp_path / "bar.xml"
+    path.write_text(
+        """<mujoco><option gravity="0 0 -10"/><worldbody><body><joint axis="0 1 0"/>
+        <geom size=".02" pos="1 0 0" mass="1.2"/><site name="grip" pos="2 0 0"/></body></worldbody>
+        </mujoco>"""
+    )
+    force = 12.0 * 2.0 / (4.0 + 1.0 / 135.0)
+    assert hand_for(load_scene(path)).stiffness == pytest.approx(force / 0.005, rel=1e-6)

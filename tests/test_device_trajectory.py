@@ -107,8 +107,12 @@ TURNED = "t,x,y,z,qw,qx,qy,qz\n"
 
 @pytest.mark.parametrize(
     "text",
-    ["t;x;y;z\n0;0;0;0\n0,5;0,01;-1e-3;0\n", "t\tx\ty\tz\n0\t0\t0\t0\n.5\t.01\t-.001\t0\n"],
-    ids=["semicolons and decimal commas", "tabs"],
+    [
+        "t;x;y;z\n0;0;0;0\n0,5;0,01;-1e-3;0\n",
+        "t\tx\ty\tz\n0\t0\t0\t0\n.5\t.01\t-.001\t0\n",
+        '"t", "x","y","z"\n"0","0","0","0"\n"0.5", ".01","-.001",0\n',
+    ],
+    ids=["semicolons and decimal commas", "tabs", "quotes"],
 )
 def test_columns_may_be_separated_as_other_programs_do(tmp_path: Path, text: str) -> None:
     file = tmp_path / "motion.csv"

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hapticbridge.device.profile import profiles
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel import jit, machine_code
 from hapticbridge.kernel.jit import Program, compiled, direct, external, prepare
@@ -242,10 +243,10 @@ def test_a_file_that_others_can_write_is_not_loaded(folder: Path) -> None:
 
 
 @pytest.fixture
-def no_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Path], str]]:
+def no_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Path | str], str]]:
     """Moves the cache to where none may be; returns the reason that is told."""
 
-    def move(place: Path) -> str:
+    def move(place: Path | str) -> str:
         monkeypatch.setenv("NUMBA_CACHE_DIR", str(place))
         jit.cache_folder.cache_clear()
         with pytest.warns(UserWarning, match="machine code is not kept") as told:
@@ -258,7 +259,7 @@ def no_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Path], str]
 
 
 def test_a_folder_that_cannot_be_written_costs_only_time(
-    tmp_path: Path, no_folder: Callable[[Path], str]
+    tmp_path: Path, no_folder: Callable[[Path | str], str]
 ) -> None:
     (tmp_path / "file").touch()
     assert "cannot be written: File exists" in no_folder(tmp_path / "file" / "cache")
@@ -315,7 +316,7 @@ OPEN: dict[str, tuple[str, int]] = {
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX permissions")
 @pytest.mark.parametrize("name", OPEN)
 def test_no_code_is_taken_from_a_folder_that_others_can_write(
-    name: str, tmp_path: Path, no_folder: Callable[[Path], str]
+    name: str, tmp_path: Path, no_folder: Callable[[Path | str], str]
 ) -> None:
     (tmp_path / "cache" / "machine_code").mkdir(mode=0o700, parents=True)
     place, mode = OPEN[name]
@@ -326,7 +327,7 @@ def test_no_code_is_taken_from_a_folder_that_others_can_write(
 @pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="needs root's chown")
 @pytest.mark.parametrize("place", ["cache/machine_code", "cache", "."])
 def test_no_code_is_taken_from_a_folder_of_another_user(
-    place: str, tmp_path: Path, no_folder: Callable[[Path], str]
+    place: str, tmp_path: Path, no_folder: Callable[[Path | str], str]
 ) -> None:
     (tmp_path / "cache" / "machine_code").mkdir(mode=0o700, parents=True)
     os.chown(tmp_path / place, 65534, 65534)
@@ -479,3 +480,18 @@ def test_functions_read_no_released_memory_when_the_process_ends() -> None:
     overwriting = {"PYTHONMALLOC": "malloc", "MALLOC_PERTURB_": "255"}
     process = subprocess.run([sys.executable, "-c", END], env=os.environ | overwriting, check=False)
     assert process.returncode == 0
+
+
+def test_a_user_without_a_home_is_told_how_to_name_a_folder(
+    monkeypatch: pytest.MonkeyPatch, no_folder: Callable[[Path | str], str]
+) -> None:
+    """As a user id of a container that the system's list lacks; an empty setting is none."""
+
+    def unknown(number: int) -> None:
+        raise KeyError(number)
+
+    for name in ("HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", unknown)
+    assert no_folder("").endswith("no home directory; set HOME or NUMBA_CACHE_DIR")
+    assert "omega3" in profiles()

@@ -708,3 +708,18 @@ def test_parts_of_a_specification_keep_the_assets_of_their_own_folders(tmp_path:
     file = tmp_path / "run.mcap"
     recorded(file, scene, duration=0.05)
     assert audit(file).resimulation == "bit for bit"
+
+
+def test_a_specification_that_mujoco_writes_wrongly_is_told_so() -> None:
+    """It compiles, but its file names the default class of the part and its own alike."""
+    text = """<mujoco><default><default class="steel"><geom density="{}"/></default></default>
+        <worldbody><body name="tool"><freejoint/><geom class="steel" size=".1"/><site name="grip"/>
+        </body></worldbody></mujoco>"""
+    whole = mujoco.MjSpec.from_string(text.format(8000).replace("tool", "base").replace("grip", ""))
+    part = mujoco.MjSpec.from_string(text.format(7000))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # MuJoCo's own, of an empty prefix
+        whole.worldbody.add_frame().attach_body(part.body("tool"), "", "")
+        assert whole.copy().compile().nbody == 3
+        with pytest.raises(SceneError, match=r"repeated default class name.* attach the part with"):
+            load_scene(whole)

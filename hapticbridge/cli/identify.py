@@ -23,7 +23,7 @@ from hapticbridge.device import AXES, DeviceInfo, open_device
 from hapticbridge.device.base import checked_close
 from hapticbridge.device.profile import Profile, own_folder
 from hapticbridge.errors import HapticBridgeError, choices
-from hapticbridge.files import reason_of
+from hapticbridge.files import NO_HOME, reason_of
 from hapticbridge.identify import Identification, identify
 from hapticbridge.identify.fit import CONFIDENCE
 from hapticbridge.identify.identify import (
@@ -327,7 +327,10 @@ class Identify:
         """Returns where the profile goes; None where it is not kept."""
         if self.save is not None or not is_real:
             return self.save
-        return own_folder() / f"{'-'.join(filter(None, (profile.device, profile.serial)))}.toml"
+        if (folder := own_folder()) is None:
+            notify(f"the profile is not kept: {NO_HOME}, or name a file with --save")
+            return None
+        return folder / f"{'-'.join(filter(None, (profile.device, profile.serial)))}.toml"
 
 
 def _write(profile: Profile, path: Path) -> str:

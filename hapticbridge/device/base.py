@@ -464,6 +464,17 @@ def checked_start(device: Device) -> Callable[[float], NDArray[np.void]]:
     return checked
 
 
+def device_fault(device: object) -> str:
+    """Returns what keeps an object from being a device, as "lacks close"; empty for a device."""
+    if isinstance(device, type):
+        return "is a class, and no object of it"
+    if not isinstance(getattr(device, "info", None), DeviceInfo):
+        return "has no DeviceInfo as info"
+    calls = ("start", "read", "write", "close")
+    lacking = [call for call in calls if not callable(getattr(device, call, None))]
+    return f"lacks {', '.join(lacking)}" if lacking else ""
+
+
 def checked_close(device: Device) -> Callable[[], None]:
     """Returns the device's ``close``; for a device of another package, one whose errors are told.
 

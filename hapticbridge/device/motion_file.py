@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import csv
 import os
 import re
 import stat
@@ -61,14 +62,15 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
     header = next(numbered, None)
     if header is None:
         raise DeviceError(f"{path}: the file is empty; it needs a header t,x,y,z and two rows")
-    with_commas = _COMMAS[next((each for each in _COMMAS if each in header[1]), "\t")]
-    names = _column_names(f"{path}, line {header[0]}", header[1].translate(with_commas))
+    separator = next((each for each in ";,\t" if each in header[1]), ",")
+    where = f"{path}, line {header[0]}"
+    names = _column_names(where, header[1], _fields(where, header[1], separator))
     width = len(names)
     columns = [names.index(name) for name in TIME_AND_POSITION + ORIENTATION if name in names]
     numbers: list[int] = []
     values: list[float] = []
     for number, line in numbered:
-        fields = line.translate(with_commas).split(",")
+        fields = _fields(f"{path}, line {number}", line, separator)
         if len(fields) != width:
             raise DeviceError(
                 f"{path}, line {number}: {len(fields)} fields where the header names "
@@ -97,8 +99,17 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
     return _plausible(table, path)
 
 
-_COMMAS = {";": {ord(";"): ",", ord(","): "."}, ",": dict[int, str](), "\t": {ord("\t"): ","}}
-"""Characters to replace in a line, by the character that separates the columns in its header."""
+def _fields(where: str, line: str, separator: str) -> list[str]:
+    """Returns the fields of a line without their quotes, semicolons' with decimal points.
+
+    Raises:
+        DeviceError: A field has more characters than the module csv takes.
+    """
+    try:
+        fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    except csv.Error as error:
+        raise DeviceError(f"{where}: cannot be read ({error})") from None
+    return [field.replace(",", ".") for field in fields] if separator == ";" else fields
 
 
 def _read_lines(path: Path) -> list[str]:
@@ -123,10 +134,9 @@ def _read_lines(path: Path) -> list[str]:
         raise DeviceError(f"{path}: cannot be read ({reason})") from None
 
 
-def _column_names(where: str, line: str) -> list[str]:
+def _column_names(where: str, line: str, fields: list[str]) -> list[str]:
     """Returns the valid column names of a header."""
-    # some programs quote column names, but not numbers
-    names = [field.strip().strip("\"'").strip().lower() for field in line.split(",")]
+    names = [field.strip().strip("\"'").strip().lower() for field in fields]
     needed = "a header with the columns t,x,y,z and optionally qw,qx,qy,qz is needed"
     if all(_is_number(name) for name in names):
         raise DeviceError(f"{where}: numbers where {needed}")

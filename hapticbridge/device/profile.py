@@ -32,6 +32,7 @@ import tomli_w
 from hapticbridge.arguments import is_number
 from hapticbridge.device.base import AXES, DATA_SHEET_UNITS, DeviceInfo, checked_number
 from hapticbridge.errors import DeviceError, choices
+from hapticbridge.files import user_folder
 
 FORMAT = 1
 """Version of the file format."""
@@ -220,18 +221,20 @@ def _quantity(name: str, table: object) -> Quantity:
 SHIPPED = Path(__file__).parent / "profiles"
 
 
-def own_folder() -> Path:
-    """Returns the folder of the user's own profiles, which may not exist.
+def own_folder() -> Path | None:
+    """Returns the folder of the user's own profiles, which may not exist; None without a home.
 
     It is in the platform's configuration folder; ``identify`` writes profiles there.
     """
-    return Path(platformdirs.user_config_dir("hapticbridge", appauthor=False)) / "devices"
+    above = user_folder(platformdirs.user_config_dir)
+    return above and above / "devices"
 
 
 def profiles() -> dict[str, Path]:
     """Returns all profiles by name; the user's own replace shipped ones of equal name."""
     found = {path.stem: path for path in sorted(SHIPPED.glob("*.toml"))}
-    found |= {path.stem: path for path in sorted(own_folder().glob("*.toml"))}
+    if own := own_folder():
+        found |= {path.stem: path for path in sorted(own.glob("*.toml"))}
     return found
 
 

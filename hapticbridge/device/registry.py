@@ -27,7 +27,13 @@ from pathlib import Path
 from typing import Any
 
 from hapticbridge.arguments import number_from
-from hapticbridge.device.base import Device, DeviceInfo, calling_on_error, checked_close, telling
+from hapticbridge.device.base import (
+    Device,
+    calling_on_error,
+    checked_close,
+    device_fault,
+    telling,
+)
 from hapticbridge.device.driver import Driver, FoundDevice, Notify, Options, ignore_message
 from hapticbridge.device.motion_file import is_bag, read_bag, read_motion
 from hapticbridge.device.profile import modelled, profile_named, profile_of
@@ -138,8 +144,8 @@ def _with_device_errors(driver: Driver, package: str) -> Driver:
     def opened(options: Mapping[str, object], notify: Notify) -> Device:
         with telling(f"{about}: open"):
             device = driver.open(options, notify)
-            if not isinstance(getattr(device, "info", None), DeviceInfo):
-                raise TypeError("it must return a device with a DeviceInfo as info")
+            if fault := device_fault(device):
+                raise TypeError(f"it must return a device, and what it returned {fault}")
             return device
 
     return replace(

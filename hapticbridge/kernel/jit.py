@@ -25,6 +25,7 @@ import numpy as np
 import platformdirs
 
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.files import NO_HOME, user_folder
 from hapticbridge.kernel import machine_code
 
 _Function = TypeVar("_Function", bound=Callable[..., object])
@@ -37,9 +38,10 @@ def cache_folder() -> Path | None:
     ``NUMBA_CACHE_DIR`` moves the folder. Without a folder everything is compiled in memory, in
     every process; a warning has the reason.
     """
-    usual = platformdirs.user_cache_dir("hapticbridge", appauthor=False)
-    folder = (Path(os.environ.get("NUMBA_CACHE_DIR") or usual) / "machine_code").resolve()
-    fault = machine_code.fault_of(folder)
+    set_by_user = os.environ.get("NUMBA_CACHE_DIR")
+    above = Path(set_by_user) if set_by_user else user_folder(platformdirs.user_cache_dir)
+    folder = above and (above / "machine_code").resolve()
+    fault = machine_code.fault_of(folder) if folder else f"{NO_HOME} or NUMBA_CACHE_DIR"
     if fault:
         warnings.warn(
             f"machine code is not kept, so every start compiles for a minute: {fault}",

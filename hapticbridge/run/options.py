@@ -42,7 +42,7 @@ from hapticbridge.demand.methods import (
 )
 from hapticbridge.demand.pulse import PULSES, USUAL_PULSE, Tap, pulse_of
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
-from hapticbridge.device.base import calling_on_error
+from hapticbridge.device.base import calling_on_error, device_fault
 from hapticbridge.device.own_loop import LoopDevice
 from hapticbridge.device.simulated.dynamics import DEFAULT_HAND
 from hapticbridge.errors import (
@@ -387,10 +387,11 @@ def device_for_run(
             clock is simulated, or states a loop of its own that it lacks.
     """
     if not isinstance(device, str):
-        if not isinstance(getattr(device, "info", None), DeviceInfo):
+        if fault := device_fault(device):
             raise DeviceError(
-                f"device is {shown(device)}; it must be a string such as 'simulated', or an object "
-                "with the calls of hapticbridge.Device and its data sheet 'info'"
+                f"device is {shown(device)}, which {fault}; it must be a string such as "
+                "'simulated', or an object with the calls of hapticbridge.Device and its data "
+                "sheet 'info'"
             )
         _refuse_missing_loop(device)
         yield device

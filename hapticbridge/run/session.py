@@ -324,7 +324,7 @@ class Session:
             now=lambda: 1e-9 * clock.now(),
         )
         with ExitStack() as resources:
-            resources.callback(device.close)  # ``_open`` says why it is called twice
+            resources.callback(checked_close(device))  # ``_open`` says why it is called twice
             self._open(resources)
             resources.callback(self.command_zero_force)
             self._resources = resources.pop_all()

@@ -288,7 +288,11 @@ def _name_folders(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
 def _written(source: SceneSource) -> SceneSource:
     """Returns a specification as it is read back from its recorded sources."""
     main, *assets = source.sources
-    with _refused(source.path):
+    remark = (
+        "; that is the specification as MuJoCo writes it, and a run records it so: where a name is "
+        "repeated, attach the part with a prefix"
+    )
+    with _refused(source.path, remark):
         spec = mujoco.MjSpec.from_string(
             main.data.decode(), assets={asset.name: asset.data for asset in assets}
         )
@@ -445,14 +449,14 @@ def _start_set(
 
 
 @contextmanager
-def _refused(path: Path) -> Iterator[None]:
+def _refused(path: Path, remark: str = "") -> Iterator[None]:
     """Converts MuJoCo's errors during compilation into a SceneError that names the scene."""
     try:
         yield
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
         words = folder_words(error) if isinstance(error, OSError) else ""
         words = words or _found_nowhere(path, error)
-        raise SceneError(f"cannot compile scene '{path}': {words}") from None
+        raise SceneError(f"cannot compile scene '{path}': {words}{remark}") from None
 
 
 def _found_nowhere(path: Path, error: Exception) -> str:

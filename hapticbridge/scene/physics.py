@@ -121,22 +121,25 @@ def geom_inertia(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float
     return _inertia_along(model, data, jacobian)
 
 
-def site_weight(model: mujoco.MjModel, data: mujoco.MjData, site: int) -> float:
+def site_weight(model: mujoco.MjModel, data: mujoco.MjData, site: int, length: float) -> float:
     """Returns the force in N that holds a site against weight, springs and motors at rest.
 
-        f = (J M⁻¹ Jᵀ)⁺ J a
+        (f, τ/ℓ) = (J M⁻¹ Jᵀ)⁺ J a
 
     with the acceleration a that the scene has without constraints, so that what a table bears
-    counts. ``data`` must be current (``mj_forward``). A door on an upright hinge has none.
+    counts, and J = (J_p; ℓ J_r). What holds the site also turns it back, with a rotational
+    stiffness that is the ``length`` ℓ in m squared times its stiffness. ``data`` must be current
+    (``mj_forward``). A door on an upright hinge has none.
     """
     if model.nv == 0:
         return 0.0
-    jacobian = np.zeros((3, model.nv))
-    mujoco.mj_jacSite(model, data, jacobian, None, site)
+    jacobian = np.zeros((6, model.nv))
+    mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], site)
+    jacobian[3:] *= length
     answer = np.zeros_like(jacobian)
     mujoco.mj_solveM(model, data, answer, jacobian)
     inertia = np.linalg.pinv(jacobian @ answer.T, rcond=1e-6, hermitian=True)
-    return float(np.linalg.norm(inertia @ jacobian @ data.qacc_smooth))
+    return float(np.linalg.norm((inertia @ jacobian @ data.qacc_smooth)[:3]))
 
 
 def _inertia_along(

@@ -113,7 +113,8 @@ def hand_for(scene: Scene) -> Hand:
     hand = scene_hand(scene.model, scene.path)
     if custom_numbers(scene.model, SCENE_HAND) or scene.joint >= 0:
         return hand
-    weight = site_weight(scene.model, scene.data, scene.model.site(scene.grip).id)
+    length = math.sqrt(hand.rotational_stiffness / hand.stiffness)
+    weight = site_weight(scene.model, scene.data, scene.model.site(scene.grip).id, length)
     if not hand.stiffness * MAX_LIFT < weight <= USUAL_FORCE_LIMIT:
         return hand
     stiffness = weight / LIFT_SAG
