@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -88,11 +88,7 @@ def body_inertia(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> float
     is included; ``data`` must be current (``mj_forward``). A body that cannot move has infinite
     inertia.
     """
-    if model.nv == 0 or model.body_treeid[body] < 0:
-        return math.inf
-    jacobian = np.zeros((3, model.nv))
-    mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
-    return _inertia_along(model, data, jacobian)
+    return _inertia_at(model, data, mujoco.mj_jacBodyCom, body)
 
 
 def tool_masses(model: mujoco.MjModel, grip: str) -> tuple[float, float]:
@@ -105,20 +101,12 @@ def tool_masses(model: mujoco.MjModel, grip: str) -> tuple[float, float]:
 
 def site_inertia(model: mujoco.MjModel, data: mujoco.MjData, site: int) -> float:
     """Returns the inertia in kg at a site, as ``body_inertia`` at a centre of mass."""
-    if model.nv == 0:
-        return math.inf
-    jacobian = np.zeros((3, model.nv))
-    mujoco.mj_jacSite(model, data, jacobian, None, site)
-    return _inertia_along(model, data, jacobian)
+    return _inertia_at(model, data, mujoco.mj_jacSite, site)
 
 
 def geom_inertia(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
     """Returns the inertia in kg at a geom's centre, as ``body_inertia`` at a centre of mass."""
-    if model.nv == 0:
-        return math.inf
-    jacobian = np.zeros((3, model.nv))
-    mujoco.mj_jacGeom(model, data, jacobian, None, geom)
-    return _inertia_along(model, data, jacobian)
+    return _inertia_at(model, data, mujoco.mj_jacGeom, geom)
 
 
 def site_weight(model: mujoco.MjModel, data: mujoco.MjData, site: int, length: float) -> float:
@@ -142,9 +130,13 @@ def site_weight(model: mujoco.MjModel, data: mujoco.MjData, site: int, length: f
     return float(np.linalg.norm((inertia @ jacobian @ data.qacc_smooth)[:3]))
 
 
-def _inertia_along(
-    model: mujoco.MjModel, data: mujoco.MjData, jacobian: NDArray[np.float64]
+def _inertia_at(
+    model: mujoco.MjModel, data: mujoco.MjData, jacobian_of: Callable[..., None], place: int
 ) -> float:
+    if model.nv == 0:
+        return math.inf
+    jacobian = np.zeros((3, model.nv))
+    jacobian_of(model, data, jacobian, None, place)
     answer = np.zeros_like(jacobian)
     mujoco.mj_solveM(model, data, answer, jacobian)
     weight = float(np.linalg.eigvalsh(jacobian @ answer.T)[-1])
