@@ -421,9 +421,13 @@ def test_rerun_reads_its_file(run_file: Path, tmp_path: Path) -> None:
     done = export(run_file, "rerun", target)
     assert done.ticks == len(read_recording(run_file).ticks)
 
+    home = os.environ | {"HOME": str(tmp_path)}  # where it writes its settings
+
     def rerun(*words: str) -> str:
         command = [sys.executable, "-m", "rerun", "rrd", *words, str(target)]
-        found = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+        found = subprocess.run(
+            command, capture_output=True, text=True, timeout=60, check=True, env=home
+        )
         return found.stdout + found.stderr
 
     assert "without error" in rerun("verify")
