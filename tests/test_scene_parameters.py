@@ -17,8 +17,9 @@ import hapticbridge as hb
 from hapticbridge import scene as scenes
 from hapticbridge.audit.recorded_scene import compile_recorded, is_as_recorded
 from hapticbridge.cli import main
+from hapticbridge.kernel.mujoco_c import copy_of
 from hapticbridge.run.description import model_digest
-from hapticbridge.scene import load_scene, parameters, scene_path
+from hapticbridge.scene import load_scene, scene_path
 
 PARAMETERS = [
     (name, p) for name in scenes.scene_names() for p in scenes.scene_parameters(scene_path(name))
@@ -359,13 +360,12 @@ def test_the_effect_of_a_pattern_is_tried_on_a_few_of_its_elements(
 ) -> None:
     """Each trial compiles the scene, and a bowl has some two hundred beads with three joints."""
     trials = list[mujoco.MjSpec]()
-    copy_of = parameters.copy_of
 
     def counted(spec: mujoco.MjSpec) -> mujoco.MjSpec:
         trials.append(spec)
         return copy_of(spec)
 
-    monkeypatch.setattr(parameters, "copy_of", counted)
+    monkeypatch.setattr("hapticbridge.scene.parameters.copy_of", counted)
     scene = load_scene("beads", mass=0.001, drag=0.01)
     assert scene.model.nv > 600
     assert len(trials) < 20
