@@ -14,7 +14,7 @@ from hapticbridge.kernel.codes import held_body
 from hapticbridge.scene.fault import Fault, length, number, others, weight
 from hapticbridge.scene.handle import tied_trees
 from hapticbridge.scene.physics import body_inertia
-from hapticbridge.scene.rehearsal import stiffness_without_hand, wrench_sizes
+from hapticbridge.scene.rehearsal import stiffness_without_hand
 from hapticbridge.units import format_degrees, format_number
 
 WATER = 1000.0
@@ -177,7 +177,7 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     stiffness += stiffness_without_hand(model, data, dofs, has_weight=False)
     free = _unconstrained(model, data, dofs) if tied else np.eye(dofs.size)
     moved = free @ np.linalg.lstsq(free.T @ stiffness @ free, free.T @ pulls, rcond=1e-9)[0]
-    sag, droop = wrench_sizes(tool_jacobian @ moved)
+    sag, droop = map(float, np.linalg.norm((tool_jacobian @ moved).reshape(2, 3), axis=1))
     parts = []
     if sag > MAX_SAG:
         parts.append(

@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull
 from hapticbridge.check.version import MotionTrace, SceneVariant, census, model_of
 from hapticbridge.scene.compile import unfused_model
 from hapticbridge.scene.physics import IDENTITY, matrix_of, pose_in, quaternion_of, rotation_vector
+from hapticbridge.units import format_count
 
 OTHER_MOTIONS, PICTURE = "in this motion", "with the picture"
 """Losses of a simplification that a hand cannot notice in one motion."""
@@ -70,7 +71,7 @@ def _iterations(count: int, used: int) -> Simplification:
         option.iterations = count
         return True
 
-    name = f"{count} iteration{'s' * (count > 1)}"
+    name = format_count(count, "iteration")
     return Simplification(name, f"the solver stops after {count} of up to {used}", limit)
 
 
@@ -96,7 +97,7 @@ def _substeps(count: int, present: int) -> Simplification:
         draft.setting = replace(draft.setting, substeps=min(draft.setting.substeps, count))
         return changed
 
-    name = f"{count} substep{'s' * (count > 1)}"
+    name = format_count(count, "substep")
     return Simplification(name, f"MuJoCo takes {count} of {present} steps a tick", lower)
 
 

@@ -40,7 +40,7 @@ from hapticbridge.plotting import check_ending
 from hapticbridge.run.options import BridgeOptions
 from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.theory.z_width import ZWidth, z_width
-from hapticbridge.units import format_number, format_si
+from hapticbridge.units import format_count, format_number, format_si
 
 REPLACED = {"mass", "damping", "friction", "rotational_inertia", "rotational_damping", "delay"}
 """Numbers of a data sheet in whose place a measurement goes."""
@@ -170,7 +170,7 @@ def _sheet_words(info: DeviceInfo, period: float) -> str:
     listed = [f"{name}={each:.6g}" for name, each in known.items() if each is not None]
     listed += ["is_delay_measured=True"] * info.is_delay_measured
     late = delay_ticks(info, period)
-    ticks = "" if late is None else f"; the delay counts as {late} tick{'s' * (late != 1)}"
+    ticks = "" if late is None else f"; the delay counts as {format_count(late, 'tick')}"
     return f"in a class of your own: DeviceInfo({', '.join(listed)}){ticks}"
 
 

@@ -18,7 +18,7 @@ from hapticbridge.replay.film import USUAL_SHOT, Shot, draw
 from hapticbridge.tools.compare import Comparison, Difference, compare
 from hapticbridge.tools.dataset import DATASETS, write_dataset
 from hapticbridge.tools.export import EVERYTHING, Part, export, time_of
-from hapticbridge.units import format_si
+from hapticbridge.units import format_count, format_si
 from hapticbridge.view import Address
 from hapticbridge.view.window import check_view
 
@@ -226,8 +226,7 @@ class Export:
             print_json(asdict(done) | {"folder": str(done.folder)})
         else:
             frames = f"{sum(done.episodes)} frames at {shot.fps} Hz"
-            count = len(done.episodes)
-            episodes = "1 episode" if count == 1 else f"{count} episodes"
+            episodes = format_count(len(done.episodes), "episode")
             out.print(f"wrote {plain(str(done.folder))}: {episodes}, {frames}")
         _tell_coupled(done.coupled)
         for file, resets, end in zip(self.files, done.resets, done.ends, strict=True):

@@ -46,7 +46,7 @@ from hapticbridge.theory.bounds import (
 )
 from hapticbridge.theory.transfer import MAX_DELAY
 from hapticbridge.theory.z_width import ZWidth, z_width
-from hapticbridge.units import format_number, format_si
+from hapticbridge.units import format_count, format_number, format_si
 
 _ARGUMENTS = Arguments(HapticBridgeError)
 
@@ -168,7 +168,7 @@ class Zwidth:
             _ARGUMENTS.number("--delay", self.delay, "s", least=0, most=MAX_DELAY * period), period
         )
         if delay:
-            ticks = "1 tick" if delay == 1 else f"{delay} ticks"
+            ticks = format_count(delay, "tick")
             notify(f"a delay of {format_si(self.delay, 's')} counts as {ticks}")
         if info is not None:
             numbers = {

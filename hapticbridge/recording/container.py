@@ -20,6 +20,7 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.units import format_count
 
 # Random access to a file's bytes
 
@@ -264,7 +265,7 @@ class Container:
         end = first + _FOOTER_SIZE + len(MAGIC)
         more = len(self._data) - end
         self.problems.append(
-            f"its end is followed by {more} more byte{'s' * (more > 1)} ('truncate -s {end}' takes "
+            f"its end is followed by {format_count(more, 'more byte')} ('truncate -s {end}' takes "
             "them away)"
         )
 

@@ -662,13 +662,13 @@ class RunSetup(StepTimes):
         """
         model, data = self.scene.model, mujoco.MjData(self.scene.model)
         grip = model.site(self.scene.grip).id
-        pairs = [pair[:2] for pair in meeting_pairs(model, moving_geoms(model, grip))]
+        is_part, is_tool = moving_geoms(model, grip), tool_geoms(model, grip)
+        pairs = [pair[:2] for pair in meeting_pairs(model, is_part)]
         if not pairs:
             return None
         data.qpos[:] = self.scene.data.qpos
         mujoco.mj_forward(model, data)  # a check of the scene may have left another inertia
         mass = site_inertia(model, data, grip)
-        is_tool, is_part = tool_geoms(model, grip), moving_geoms(model, grip)
         geoms = {geom for pair in pairs for geom in pair if is_part[geom]}
         if not any(is_tool[geom] for geom in geoms):
             mass = min(geom_inertia(model, data, geom) for geom in geoms)

@@ -13,6 +13,7 @@ import numpy as np
 from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, added_actuators, held_body, held_joint
 from hapticbridge.scene.source import REPLACED, SourceFile, read_elements
+from hapticbridge.units import format_count
 
 # Requirements of the rendering methods for comparison on a scene
 
@@ -555,7 +556,7 @@ def overlaps(model: mujoco.MjModel, data: mujoco.MjData, depth: float) -> list[O
 def listed(overlapping: list[Overlap]) -> str:
     """Returns the deepest of some overlaps, and the number of the others."""
     count = len(overlapping) - 1
-    return str(overlapping[0]) + (f" (and {count} more pair{'s' * (count > 1)})" if count else "")
+    return str(overlapping[0]) + (f" (and {format_count(count, 'more pair')})" if count else "")
 
 
 def refuse_overlap(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:

@@ -496,7 +496,7 @@ def write_dataset(
     if folder.exists():
         raise RecordingError(f"'{folder}' exists; choose another folder")
     recordings = [_sound(open_recording(path)) for path in paths]
-    draft, counts, coupled = draft_of(folder), [], tuple[str, ...]()
+    draft, counts, coupled = draft_of(folder), [], dict[str, None]()
     try:
         shutil.rmtree(draft, ignore_errors=True)
         draft.mkdir()
@@ -505,7 +505,7 @@ def write_dataset(
             for episode in _episodes(recordings, shot, progress):
                 writer.add(episode)
                 counts.append(len(episode))
-                coupled = episode.coupled
+                coupled |= dict.fromkeys(episode.coupled)
             writer.finish()
         draft.rename(folder)
     except OSError as error:
@@ -514,7 +514,7 @@ def write_dataset(
         shutil.rmtree(draft, ignore_errors=True)
     ends = (unusual_end(Trip.among(each.events), each.events) for each in recordings)
     resets = tuple(map(_resets, recordings))
-    return WrittenDataset(folder, tuple(counts), resets, tuple(ends), coupled)
+    return WrittenDataset(folder, tuple(counts), resets, tuple(ends), tuple(coupled))
 
 
 def _placings(recording: RecordingFile) -> list[Mapping[str, Any]]:

@@ -14,6 +14,7 @@ from hapticbridge.errors import StudyError
 from hapticbridge.kernel.parameters import StepTimes
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import Scene
+from hapticbridge.units import format_count
 
 OWN = "hapticbridge"
 """Name of the bridge itself, in its compiled loop around MuJoCo. Other engines have their own
@@ -91,8 +92,7 @@ class Setting(StepTimes):
         if not self.has_usual_contact:
             parts.append(f"contact: {self.contact}")
         if self.iterations is not None:
-            plural = "" if self.iterations == 1 else "s"
-            parts.append(f"{self.iterations} solver iteration{plural}")
+            parts.append(format_count(self.iterations, "solver iteration"))
         return ", ".join(parts)
 
 
