@@ -27,6 +27,12 @@ def bar(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bar_run(tmp_path_factory.mktemp("bar") / "run.mcap", 0.3)
 
 
+@pytest.fixture(scope="module")
+def long_bar(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    # so long that a recorder which writes nothing for its whole time has a full chunk
+    return bar_run(tmp_path_factory.mktemp("long") / "run.mcap", 2.0)
+
+
 def bar_run(path: Path, seconds: float) -> Path:
     """Records two hands on a bar; returns the path."""
     hands = [hb.Grasp("left"), hb.Grasp("right", "simulated:damping=3")]
@@ -106,16 +112,14 @@ def test_a_table_has_the_hand_that_is_named(
     assert "takes one with --hand" in " ".join(capsys.readouterr().err.split())
 
 
-def test_a_cut_recording_of_two_hands_is_repaired(tmp_path: Path) -> None:
+def test_a_cut_recording_of_two_hands_is_repaired(long_bar: Path, tmp_path: Path) -> None:
     cut, whole = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
-    # so long that a recorder which writes nothing for its whole time has a full chunk
-    long = bar_run(tmp_path / "long.mcap", 2.0)
-    data = long.read_bytes()
+    data = long_bar.read_bytes()
     cut.write_bytes(data[: int(0.97 * len(data))])
     first = hb.repair(cut, whole)
     hands = read_hands(whole)
     assert first.hands == len(hands) == 2
-    for mended, original in zip(hands, read_hands(long), strict=True):
+    for mended, original in zip(hands, read_hands(long_bar), strict=True):
         assert 0 < mended.ticks.size < original.ticks.size
         assert mended.ticks.tobytes() == original.ticks[: mended.ticks.size].tobytes()
     report = hb.audit(whole, in_process=True)
@@ -123,14 +127,14 @@ def test_a_cut_recording_of_two_hands_is_repaired(tmp_path: Path) -> None:
 
 
 def test_records_of_a_recorder_that_died_are_added_for_both_hands(
-    bar: Path, tmp_path: Path
+    long_bar: Path, tmp_path: Path
 ) -> None:
     cut = tmp_path / "cut.mcap"
-    data = bar.read_bytes()
-    cut.write_bytes(data[: int(0.7 * len(data))])
-    whole = read_hands(bar)
+    data = long_bar.read_bytes()
+    cut.write_bytes(data[: int(0.97 * len(data))])
+    whole = read_hands(long_bar)
     rows = np.stack([hand.ticks for hand in whole], axis=1).ravel()
-    assert "all 600 records are there" in salvage(cut, rows[1:], whole[0].events)
+    assert "all 4000 records are there" in salvage(cut, rows[1:], whole[0].events)
     for mended, original in zip(read_hands(cut), whole, strict=True):
         assert mended.ticks.tobytes() == original.ticks.tobytes()
 
