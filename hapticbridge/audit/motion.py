@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.events import AuditState, RunEvents
+from hapticbridge.kernel.law import LARGEST_TWIST
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.record import TickFlag, has_flag
 
@@ -153,6 +154,13 @@ def torque_across(gains: Array, parameters: RunParameters) -> Array:
     return np.where(k_r > 0, np.sqrt(np.maximum(near**2 - rate**2, 0.0)), np.inf)
 
 
+def _turned_on(before: Array, twist: Array) -> Array:
+    """Returns twists that go on beyond half a turn where they came from the other side, (n, 3)."""
+    size = np.linalg.norm(twist, axis=1)
+    is_across = (size > LARGEST_TWIST) & (np.sum(before * twist, axis=1) < 0)
+    return np.where(is_across[:, None], twist * (1 - 2 * np.pi / np.fmax(size, 1))[:, None], twist)
+
+
 def wrench_by_law(
     ticks: NDArray[np.void], gains: Array, parameters: RunParameters, motion: Motion
 ) -> Array:
@@ -164,15 +172,17 @@ def wrench_by_law(
     (step, turn), period = motion.stretched, parameters.period
     k, b, k_r, b_r = (gains[:, column, None] for column in range(4))
     force = k * motion.stretch + b / period * step
-    torque = k_r * motion.twist + b_r / period * turn
+    handle = ticks["handle_quaternion"]
+    twist = _turned_on(turn_between(motion.tool_before[:, 3:], handle), motion.twist)
+    torque = k_r * twist + b_r / period * turn
     is_midpoint = has_flag(ticks, TickFlag.MIDPOINT)
     if np.any(is_midpoint):
         # quantities of the previous tick are rotated with the tool's turn
         carried = motion.carried
-        spring = 0.5 * (motion.twist + rotate(carried, motion.twist_before))
+        spring = 0.5 * (twist + rotate(carried, motion.twist_before))
         midway = 0.5 * (motion.handle_turn + rotate(carried, motion.handle_turn)) - motion.tool_turn
         midpoint = k_r * spring + (b_r / period + 0.5 * k_r) * midway
-        twists = np.stack([motion.twist, motion.twist_before])
+        twists = np.stack([twist, motion.twist_before])
         across = 0.25 * gains[:, 2] * np.linalg.norm(twists, axis=2).max(axis=0)
         most = torque_across(gains, parameters)
         share = np.divide(most, across, out=np.ones_like(across), where=across > most)

@@ -51,10 +51,12 @@ POSE_DTYPE = np.dtype(
         ("tool_quaternion", "<f8", 4),
         ("handle_step", "<f8", 3),
         ("handle_turn", "<f8", 3),
+        ("tool_turn", "<f8", 3),
     ]
 )
 """Sub-record ``pose``, written by this module alone. Positions in m, quaternions (w, x, y, z);
-``handle_step`` in m and ``handle_turn`` in rad are the handle's motion in the present tick."""
+``handle_step`` in m and ``handle_turn`` in rad are the handle's motion in the present tick,
+``tool_turn`` in rad is the tool's before the pose that was noted last."""
 
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -138,6 +140,7 @@ def follow_handle(pose: Part, loop: Part) -> None:
 
 def set_tool(pose: Part, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> None:
     """Sets the tool's pose at the start or after a reset."""
+    pose["tool_turn"] = 0.0
     pose["tool_position"] = position
     pose["tool_quaternion"] = quaternion if quaternion[0] >= 0 else -quaternion
 
@@ -212,7 +215,9 @@ def move_handle_home(pose: Part, *, at_tool: bool = False) -> None:
 
 @compiled
 def note_tool(pose: Part, position: Vector, quaternion: Quaternion) -> None:
-    """Notes the tool's new pose."""
+    """Notes the tool's new pose, and its turn since the last one."""
+    turn = rotation_between(quaternion_of(pose.tool_quaternion), quaternion)
+    store_vector(pose.tool_turn, turn)
     store_vector(pose.tool_position, position)
     store_quaternion(pose.tool_quaternion, quaternion)
 

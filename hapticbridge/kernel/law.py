@@ -349,7 +349,8 @@ def law_wrench(
     k, count = s.coupling, s.run.law_evaluations
     share, rate = 1.0 / count, count / s.run.period
     stretch = subtract(handle[0], tool[0])
-    twist = rotation_between(tool[1], handle[1])
+    before = rotation_between(quaternion_of(s.pose.tool_quaternion), handle[1])
+    twist = turned_on(before, rotation_between(tool[1], handle[1]))
     handle_step = scaled(share, vector_of(s.pose.handle_step))
     handle_turn = scaled(share, vector_of(s.pose.handle_turn))
     force = add(
@@ -652,19 +653,33 @@ def felt(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
 
 
 @compiled
-def _unwound(s: State, twist: Vector) -> Vector:
-    """Returns a twist in rad that goes on beyond half a turn, where the handle has turned across.
+def turned_on(before: Vector, twist: Vector) -> Vector:
+    """Returns a twist in rad that goes on beyond half a turn if it came from the other side.
+
+    Args:
+        before: The twist in rad a tick or step before.
+        twist: The present twist in rad, at most half a turn.
+    """
+    size = norm(twist)
+    if size <= LARGEST_TWIST or dot(before, twist) >= 0.0:
+        return twist
+    return scaled(1.0 - 2.0 * math.pi / size, twist)
+
+
+@compiled
+def unwound(s: State, twist: Vector) -> Vector:
+    """Returns a twist in rad that goes on beyond half a turn, where handle or tool turned across.
 
     Otherwise the handle would slip to ``LARGEST_TWIST`` on the other side, where the torque is
     reversed: a hand that goes to and fro by δ behind a torque a tick late gets 2.5 K_r δ − b_r δ²/T
     each time, for δ from 0.64 rad on.
     """
-    size, share = norm(twist), 1.0 / s.run.law_evaluations
-    if size <= LARGEST_TWIST:
+    if norm(twist) <= LARGEST_TWIST:
         return twist
-    back = quaternion_exp(scaled(-share, vector_of(s.pose.handle_turn)))
-    before = rotation_between(UPRIGHT, product(back, quaternion_exp(twist)))
-    return scaled(1.0 - 2.0 * math.pi / size, twist) if dot(before, twist) < 0.0 else twist
+    back = quaternion_exp(scaled(-1.0 / s.run.law_evaluations, vector_of(s.pose.handle_turn)))
+    turned = quaternion_exp(vector_of(s.pose.tool_turn))
+    before = product(product(back, quaternion_exp(twist)), turned)
+    return turned_on(rotation_between(UPRIGHT, before), twist)
 
 
 @compiled
@@ -699,7 +714,7 @@ def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     linear, angular = springs(s)
     stretch, twist = pulled(s)
     if s.guard.has_hand and (k.late_ticks > 0 or s.guard.max_angle > STOPPED_TWIST):
-        max_twist, twist = min(max_twist, LARGEST_TWIST), _unwound(s, twist)
+        max_twist, twist = min(max_twist, LARGEST_TWIST), unwound(s, twist)
     if k.owed[0] > 0.0 or k.owed[1] > 0.0:
         length, k.owed[0] = _paid(linear, norm(stretch), k.owed[0])
         angle, k.owed[1] = _paid(angular, norm(twist), k.owed[1])

@@ -53,7 +53,7 @@ from hapticbridge.kernel.explicit_bias import take_back, write_bias
 from hapticbridge.kernel.force_level import limited_wrench, limited_wrench_after_step
 from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
 from hapticbridge.kernel.jit import compiled
-from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains, torque_across
+from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains, torque_across, turned_on
 from hapticbridge.kernel.ledger import (
     add_body_wrenches,
     set_kinetic_energy,
@@ -389,7 +389,8 @@ def midpoint_torque(s: State, tool: Quaternion, turned: Vector, law: Vector) -> 
         law: The torque K_r φ_k + (B'_r/T) (δφ_h − δφ_x) in N m.
     """
     to_before, to_after = conjugate(quaternion_of(s.pose.tool_quaternion)), conjugate(tool)
-    before, after = vector_of(s.lossless.twist), twist_in_tool(s, tool)
+    before = vector_of(s.lossless.twist)
+    after = turned_on(before, twist_in_tool(s, tool))
     turn = vector_of(s.pose.handle_turn)
     handles = scaled(0.5, add(rotated(to_after, turn), rotated(to_before, turn)))
     rate = (

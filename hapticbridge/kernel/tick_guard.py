@@ -34,6 +34,7 @@ from hapticbridge.kernel.codes import (
     State,
 )
 from hapticbridge.kernel.jit import compiled
+from hapticbridge.kernel.law import unwound
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.pose import (
     Vector,
@@ -145,7 +146,7 @@ def refusal(s: State, moved: Vector, turned: Vector, elapsed: float) -> int:
     if norm(stretch) > guard.max_stretch:
         return STRETCHED
     tool, handle = quaternion_of(pose.tool_quaternion), quaternion_of(pose.handle_quaternion)
-    if norm(rotation_between(tool, handle)) > guard.max_angle:
+    if norm(unwound(s, rotation_between(tool, handle))) > guard.max_angle:
         return TWISTED
     return GAVE_ENERGY if s.observer.guarded_energy > guard.max_energy else 0
 
