@@ -26,7 +26,6 @@ from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.run.commands import UNITS
 from hapticbridge.scene.checks import first_pump, unmetered_work
 from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
 from hapticbridge.scene.physics import STEADY_WAY, Lengths
@@ -118,7 +117,7 @@ def _method_cause(method: Method, where: str = "") -> Cause:
 
 def _failing_words(failing: list[DampingCondition]) -> str:
     return "; ".join(
-        f"{c.axis}: the device's damping is {c.available:g} {UNITS[c.axis][1]}, the coupling needs "
+        f"{c.axis}: the device's damping is {c.available:g} {c.unit}, the coupling needs "
         f"{format_number(c.needed)}"
         for c in failing
     )
