@@ -409,7 +409,7 @@ def _remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
     is_rate_free = math.isclose(loop.h * loop.law_evaluations, loop.period)
     parts += ("period",) if is_rate_free and loop.lag == IN_TIME else ()
     share = {part: _largest(partial(_bears, loop, axis, available, part)) for part in parts}
-    stiffness, damping = _requested(loop).gains(axis)
+    stiffness, damping = loop.least_requested.gains(axis)
     remedies = []
     if share["stiffness"]:
         limit = _three_digits(share["stiffness"] * stiffness)
@@ -423,7 +423,7 @@ def _remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
     if not remedies:
         return _both_lowered(loop, axis, NEEDED_SHARE * available / loop.needed(axis))
     told = ", or ".join(remedies)
-    if _is_hidden(loop, axis):
+    if loop.is_hidden(axis):
         added = loop.method.compensated_share * share["stiffness"] * stiffness * loop.h
         at_most = _three_digits(added)
         told += f", with a {prefix}damping of at most {at_most} {damper}"
@@ -449,24 +449,9 @@ def _late_remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
     return told
 
 
-def _is_hidden(loop: LoopSetting, axis: Axis) -> bool:
-    """Returns True if the method took off all requested damping, which may have had any value."""
-    return loop.method.compensated_share > 0.0 and loop.law.gains(axis)[1] == 0.0
-
-
-def _requested(loop: LoopSetting) -> Coupling:
-    """Returns the smallest requested coupling of this law; hidden damping counts as 0."""
-    requested = loop.requested(loop.law)
-    return replace(
-        requested,
-        damping=0.0 if _is_hidden(loop, "translation") else requested.damping,
-        rotational_damping=0.0 if _is_hidden(loop, "rotation") else requested.rotational_damping,
-    )
-
-
 def _bears(loop: LoopSetting, axis: Axis, available: float, part: _Part, share: float) -> bool:
     """Returns True if the device has reserve after one quantity is reduced to a share."""
-    requested, faster = _requested(loop), 1.0
+    requested, faster = loop.least_requested, 1.0
     if part == "period":
         faster = share
     else:

@@ -306,6 +306,29 @@ class RunCoupling:
             else None,
         )
 
+    @classmethod
+    def of_run(
+        cls,
+        method: Method,
+        requested: Coupling,
+        run: RunParameters,
+        *,
+        was_never_lossless: bool,
+    ) -> RunCoupling:
+        """Returns the coupling of a run as its hand feels it.
+
+        ``was_never_lossless`` is True if no tick of the run was lossless.
+        """
+        coupling = cls.of(
+            method,
+            run.timestep,
+            requested,
+            law=run.coupling,
+            measured=run.effective,
+            is_always_implicit=was_never_lossless and not run.scene_ticks,
+        )
+        return coupling.felt_at(run.grip, run.scale, run.force_scale, is_apart=run.is_apart)
+
     def felt_at(
         self, grip: str, scale: float, force_scale: float, *, is_apart: bool = False
     ) -> RunCoupling:
