@@ -76,7 +76,7 @@ class Coupling:
             return self.stiffness, self.damping
         return self.rotational_stiffness, self.rotational_damping
 
-    def at(self, axis: Axis, stiffness: float, damping: float) -> Coupling:
+    def with_axis(self, axis: Axis, stiffness: float, damping: float) -> Coupling:
         """Returns the coupling with other stiffness and damping along one kind of axis."""
         if axis == "translation":
             return replace(self, stiffness=stiffness, damping=damping)

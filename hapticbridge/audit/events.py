@@ -216,7 +216,7 @@ class AuditedRun:
         linear, angular = (
             max(couplings, key=partial(demand, axis=axis)) for axis in ("translation", "rotation")
         )
-        return replace(run, coupling=linear.at("rotation", *angular.gains("rotation")))
+        return replace(run, coupling=linear.with_axis("rotation", *angular.gains("rotation")))
 
     @property
     def delay(self) -> int:

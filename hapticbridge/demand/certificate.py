@@ -99,15 +99,15 @@ def default_coupling(
     if info.loop_period is not None:
         share = NEEDED_SHARE / required_damping(Coupling(1.0, 0.0), own_period, lag=lag)
         if info.moves:
-            coupling = coupling.at("translation", share * damping, 0.0)
+            coupling = coupling.with_axis("translation", share * damping, 0.0)
         if info.turns:
-            coupling = coupling.at("rotation", share * rotational, 0.0)
+            coupling = coupling.with_axis("rotation", share * rotational, 0.0)
     elif lag != IN_TIME:
         gains = stiffest_late_coupling(damping, period, lag.delay, lag.ticks_per_sample)
-        coupling = coupling.at("translation", *gains)
+        coupling = coupling.with_axis("translation", *gains)
         if info.turns:
             gains = stiffest_late_coupling(rotational, period, lag.delay, lag.ticks_per_sample)
-            coupling = coupling.at("rotation", *gains)
+            coupling = coupling.with_axis("rotation", *gains)
     shrink = turn = 1.0
     if law_evaluations > 1 and info.loop_period is None:
         needed = required_damping(coupling, period, law_evaluations, lag=lag)
@@ -438,7 +438,7 @@ def _late_remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
         available / loop.ratio(axis), loop.period, lag.delay, lag.ticks_per_sample
     )
     softer = min(1.0, loop.law.gains(axis)[0] / stiffness)
-    law = loop.law.at(axis, softer * stiffness, softer * damping)
+    law = loop.law.with_axis(axis, softer * stiffness, softer * damping)
     k, b = loop.requested(law).gains(axis)
     told = (
         f"set the {prefix}stiffness to {_three_digits(k)} {spring} and the {prefix}damping to "
@@ -457,7 +457,7 @@ def _bears(loop: LoopSetting, axis: Axis, available: float, part: _Part, share: 
     else:
         k, b = requested.gains(axis)
         gains = (share * k, b) if part == "stiffness" else (k, share * b)
-        requested = requested.at(axis, *gains)
+        requested = requested.with_axis(axis, *gains)
     needed = loop.requesting(requested, faster).needed(axis)
     return needed <= NEEDED_SHARE * available * (1 + _ROUNDING)
 

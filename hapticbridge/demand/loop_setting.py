@@ -288,7 +288,7 @@ class LoopSetting:
         requested = self.requested(self.law)
         for axis in UNITS:
             if self.is_hidden(axis):
-                requested = requested.at(axis, requested.gains(axis)[0], 0.0)
+                requested = requested.with_axis(axis, requested.gains(axis)[0], 0.0)
         return requested
 
     def requesting(self, requested: Coupling, faster: float = 1.0) -> LoopSetting:

@@ -245,7 +245,7 @@ class AxisCouplingLimits:
         ratios = loop.period * np.array([0.0, *inner, _HIGHEST])
         needs = []
         for ratio in ratios.tolist():
-            at = replace(loop, law=self.run.start.at(self.axis, 1.0, ratio))
+            at = replace(loop, law=self.run.start.with_axis(self.axis, 1.0, ratio))
             try:
                 needs.append(at.needs()[self.axis == "rotation"])
             except CouplingError:  # the delay is beyond what the theory takes
@@ -271,7 +271,7 @@ class AxisCouplingLimits:
         It is inf where friction does not hold the encoder's steps. It takes microseconds after the
         first call, because a refusal must not slow the loop.
         """
-        requested = self.run.start.at(self.axis, stiffness, damping)
+        requested = self.run.start.with_axis(self.axis, stiffness, damping)
         steps = self.steps(requested)
         if steps is not None and (steps.needed or 0.0) > self.friction * (1.0 + 1e-9):
             return math.inf
@@ -324,7 +324,7 @@ class AxisCouplingLimits:
                 "longer feels where the tool is, or the run stops before the force is full"
             )
         needed = self.needed(stiffness, damping)
-        steps = self.steps(self.run.start.at(self.axis, stiffness, damping))
+        steps = self.steps(self.run.start.with_axis(self.axis, stiffness, damping))
         if steps is not None and needed == math.inf:
             has = f"{steps.available:.3g} N" if steps.available else "none"
             raise CommandError(
@@ -386,11 +386,11 @@ class CouplingLimits:
 
     def requested(self, command: Couple, now: Coupling) -> Coupling:
         """Returns the requested coupling after a command; omitted gains keep their values."""
-        requested = now.at("translation", command.stiffness, command.damping)
+        requested = now.with_axis("translation", command.stiffness, command.damping)
         stiffness, damping = command.rotational_stiffness, command.rotational_damping
         if self.rotation is None or stiffness is None or damping is None:
             return requested
-        return requested.at("rotation", stiffness, damping)
+        return requested.with_axis("rotation", stiffness, damping)
 
     def law(self, requested: Coupling) -> Coupling:
         """Returns the law's coupling for a requested one."""
