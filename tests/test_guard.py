@@ -21,6 +21,7 @@ from faults.catalogue import FAULTS, PUSHER
 from faults.rig import Outcome, Rig
 from numpy.typing import NDArray
 from report_runs import ANVIL
+from waiting import until
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
@@ -364,9 +365,7 @@ def test_a_killed_process_still_says_zero_and_one_that_closed_does_not(
     assert node.read_bytes() == b""
     process.send_signal(signal.SIGKILL)
     process.wait()
-    limit = time.monotonic() + 20.0
-    while node.read_bytes() != 3 * b"\0zero\1off":
-        assert time.monotonic() < limit, "nobody said zero"
+    until(lambda: node.read_bytes() == 3 * b"\0zero\1off")
     if has_forked:
         os.kill(int(holder), signal.SIGKILL)
     process.stdout.close()
