@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
-from hapticbridge.arguments import check_fields, is_number, option, rule
+from hapticbridge.arguments import check_fields, is_number, option, rule, unit_of
 from hapticbridge.errors import CouplingError, choices
 
 SQUARED_LEVER = 1e-3
@@ -76,6 +76,12 @@ class Coupling:
             return self.stiffness, self.damping
         return self.rotational_stiffness, self.rotational_damping
 
+    def with_axis(self, axis: Axis, stiffness: float, damping: float) -> Coupling:
+        """Returns the coupling with other stiffness and damping along one kind of axis."""
+        if axis == "translation":
+            return replace(self, stiffness=stiffness, damping=damping)
+        return replace(self, rotational_stiffness=stiffness, rotational_damping=damping)
+
     def with_gains(self, gains: Mapping[str, float]) -> Coupling:
         """Returns the coupling with other gains by name.
 
@@ -88,3 +94,19 @@ class Coupling:
                 f"a coupling has no gain {choices(unknown)}; its gains: {choices(names)}"
             )
         return replace(self, **gains)
+
+
+SYMBOLS: dict[Axis, tuple[str, str]] = {"translation": ("K", "B"), "rotation": ("K_r", "B_r")}
+"""Symbols of stiffness and damping by kind of axis."""
+
+UNITS: dict[Axis, tuple[str, str]] = {
+    "translation": (unit_of(Coupling, "stiffness"), unit_of(Coupling, "damping")),
+    "rotation": (
+        unit_of(Coupling, "rotational_stiffness"),
+        unit_of(Coupling, "rotational_damping"),
+    ),
+}
+"""Units of stiffness and damping by kind of axis."""
+
+PREFIX: dict[Axis, str] = {"translation": "", "rotation": "rotational "}
+"""Word before stiffness and damping by kind of axis."""

@@ -108,6 +108,19 @@ def reason_of(error: OSError, target: Path) -> str:
     return error.strerror or str(error)
 
 
+@contextmanager
+def writing(path: Path, error: type[HapticBridgeError]) -> Iterator[None]:
+    """Raises ``error`` with the reason if the block cannot write a file or folder.
+
+    Raises:
+        HapticBridgeError: ``error``.
+    """
+    try:
+        yield
+    except OSError as found:
+        raise error(f"cannot write '{path}': {reason_of(found, path)}") from None
+
+
 def check_target(path: Path, error: type[HapticBridgeError]) -> None:
     """Checks that a file can be made or replaced, before anything is computed for it.
 
@@ -116,13 +129,11 @@ def check_target(path: Path, error: type[HapticBridgeError]) -> None:
     Raises:
         HapticBridgeError: ``error``, with the reason.
     """
-    try:
+    with writing(path, error):
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, "it is a folder")
         if path.is_file() or not path.exists():
             tempfile.TemporaryFile(dir=path.resolve().parent).close()
-    except OSError as found:
-        raise error(f"cannot write '{path}': {reason_of(found, path)}") from None
 
 
 def check_regular(path: Path, error: type[HapticBridgeError]) -> None:
@@ -133,6 +144,16 @@ def check_regular(path: Path, error: type[HapticBridgeError]) -> None:
     """
     if path.exists() and not path.is_file():
         raise error(f"cannot write '{path}': it exists and is not a file")
+
+
+def refuse_existing(path: Path, error: type[HapticBridgeError], *, overwrite: bool) -> None:
+    """Refuses to replace a file that was not to be replaced.
+
+    Raises:
+        HapticBridgeError: ``error``.
+    """
+    if path.exists() and not overwrite:
+        raise error(f"'{path}' exists; choose another file or add --overwrite")
 
 
 _LIMITS = {

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.files import atomic_write, check_target, reason_of
+from hapticbridge.files import atomic_write, check_target, writing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -83,11 +83,8 @@ def write_picture(figure: Figure, path: Path) -> None:
             fails.
     """
     check_ending(path)
-    try:
-        with atomic_write(path) as draft:
-            _save(figure, draft, dpi=DOTS_PER_INCH)
-    except OSError as error:
-        raise HapticBridgeError(f"cannot write '{path}': {reason_of(error, path)}") from None
+    with writing(path, HapticBridgeError), atomic_write(path) as draft:
+        _save(figure, draft, dpi=DOTS_PER_INCH)
 
 
 def inline_svg(figure: Figure) -> str:

@@ -41,7 +41,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import StudyError, choices
-from hapticbridge.files import import_extra, reason_of
+from hapticbridge.files import import_extra, writing
 from hapticbridge.signals import holding_interrupts
 
 # Points: checked mappings of parameters, their keys, and grids of them
@@ -227,7 +227,7 @@ class Table:
         path = Path(path)
         check_format(form := path.suffix.removeprefix("."))
         columns = {name: column.tolist() for name, column in self.columns.items()}
-        try:
+        with writing(path, StudyError):
             if form == "csv":
                 with path.open("w", newline="", encoding="utf-8") as file:
                     # quoted text: a lone carriage return in it would end the row otherwise
@@ -236,8 +236,6 @@ class Table:
                     writer.writerows(zip(*columns.values(), strict=True))
             else:
                 _write_parquet(columns, path, units or {})
-        except OSError as error:
-            raise StudyError(f"cannot write '{path}': {reason_of(error, path)}") from None
 
 
 class Interrupted(KeyboardInterrupt):
@@ -312,7 +310,7 @@ class ResultFile:
             "mujoco": version("mujoco"),
             "sources": _sources(),
         }
-        try:
+        with writing(self.path, StudyError):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with self.path.open("a+b") as file:
                 file.seek(0)
@@ -321,9 +319,6 @@ class ResultFile:
                     file.write(json.dumps(identity).encode() + b"\n")
                 elif self._lines and self._lines[-1]:
                     file.write(b"\n")  # ends a line that a crash has cut
-        except OSError as error:
-            reason = reason_of(error, self.path)
-            raise StudyError(f"cannot write '{self.path}': {reason}") from None
         found = _parsed(first) if first else identity
         if found != identity:
             raise StudyError(
@@ -351,14 +346,10 @@ class ResultFile:
             json.dumps({"point": point, "results": dict(done.results), "error": done.error}) + "\n"
             for point, done in zip(points, outcomes, strict=True)
         ]
-        try:
-            with self.path.open("a", encoding="ascii") as file:
-                file.writelines(lines)
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            reason = reason_of(error, self.path)
-            raise StudyError(f"cannot write '{self.path}': {reason}") from None
+        with writing(self.path, StudyError), self.path.open("a", encoding="ascii") as file:
+            file.writelines(lines)
+            file.flush()
+            os.fsync(file.fileno())
 
 
 def _parsed(line: bytes) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from waiting import PATIENCE
 
 FLAGS = (
     "--headless",
@@ -28,9 +29,6 @@ FLAGS = (
     "--enable-unsafe-swiftshader",
     "--remote-debugging-port=0",
 )
-
-PATIENCE = 60.0
-"""Longest wait for anything, in s; a busy machine of two cores draws a page in ten."""
 
 
 class Tab:

@@ -10,14 +10,12 @@ from typing import Any
 import msgspec
 import viser
 import zstandard
+from waiting import PATIENCE
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 from websockets.typing import Subprotocol
 
 from hapticbridge.view.window import Address
-
-PATIENCE = 60.0
-"""Time in s for a page to tell what it holds."""
 
 
 class Hand:

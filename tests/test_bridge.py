@@ -42,22 +42,6 @@ def motion(tmp_path: Path) -> str:
     return f"trajectory:{path}"
 
 
-@pytest.mark.parametrize(
-    "options", ["friction=0.01,resolution=2e-5,rotational_resolution=1e-4,delay=2,path=", None]
-)
-def test_two_fast_runs_of_one_input_have_identical_payloads(
-    options: str | None, motion: str, tmp_path: Path
-) -> None:
-    device = options and f"simulated:{options}{motion.partition(':')[2]}"
-    first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
-    for path in (first, second):
-        recorded(path, "peg_in_hole", device or motion, duration=0.25)
-    a, b = payloads(first), payloads(second)
-    assert len(a) == 250
-    assert a.tobytes() == b.tobytes()
-    assert np.ptp(a["tool_position"], axis=0).max() > 1e-6
-
-
 def test_recording_leaves_the_run_as_it_is(tmp_path: Path, motion: str) -> None:
     recorded(tmp_path / "run.mcap", "peg_in_hole", motion)
     limits = Limits(force=10, torque=0.5, ramp=0.05)

@@ -6,19 +6,17 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import PATIENCE, is_alive, until
 
 from hapticbridge.audit import audit
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import read_recording, repair
-
-PATIENCE = 60.0
 
 SCRIPT = """
 import os, sys, time
@@ -46,11 +44,6 @@ class Stopped:
     status: int
     output: str
     recorder: int
-
-
-def is_gone(pid: int) -> bool:
-    status = Path(f"/proc/{pid}/stat")
-    return not status.exists() or status.read_text().rsplit(")")[-1].split()[0] == "Z"
 
 
 HOW = ("SIGINT", "SIGTERM", "SIGKILL", "both")
@@ -83,9 +76,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Stopped
             else:
                 process.send_signal(signal.SIGKILL if how == "SIGKILL" else getattr(signal, how))
             output, _ = process.communicate(timeout=PATIENCE)
-            limit = time.monotonic() + PATIENCE
-            while not is_gone(recorder):
-                assert time.monotonic() < limit, "the recorder did not end"
+            until(lambda: not is_alive(recorder))  # noqa: B023
             if child:
                 os.kill(child, signal.SIGKILL)
             stopped[how] = Stopped(path, process.returncode, output, recorder)

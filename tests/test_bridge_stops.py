@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import pytest
 from audit_cases import ScriptedDevice, SlowClock, recorded
 from bridge_runs import fast, still, sway
 from numpy.typing import NDArray
+from waiting import until
 
 from hapticbridge.audit import audit
 from hapticbridge.errors import (
@@ -30,8 +30,6 @@ from hapticbridge.recording import Recorder, Ring, read_recording
 from hapticbridge.recording import recorder as stream_module
 from hapticbridge.recording.writer import RecordingWriter
 from hapticbridge.run.bridge import Bridge
-
-PATIENCE = 30.0
 
 
 def fail(number: int) -> None:
@@ -133,9 +131,7 @@ def test_full_ring_drops_rows_in_real_time_and_the_audit_calls_the_gap(
         def resume(tick: int) -> None:
             if tick == 100:
                 os.kill(pid, signal.SIGCONT)
-                limit = time.monotonic() + PATIENCE
-                while rings[0].pending():
-                    assert time.monotonic() < limit
+                until(lambda: not rings[0].pending())
 
         summary = bridge.run(0.15, resume)
     assert summary.dropped == 36

@@ -377,7 +377,7 @@ def test_a_geom_of_an_attached_model_is_named_in_its_file_and_not_of_water_by_it
     assert [(fault.place.file, fault.place.line) for fault in told] == [
         ("part.xml", line) for line in kinds_told.values()
     ]
-    assert case.places.body(1) == Place("part.xml", 4, "body 'c-arm'")
+    assert case.places.find("body", 1) == Place("part.xml", 4, "body 'c-arm'")
     for fault in told:  # the other geom weighs, too
         assert fault.change == 'mass="…", what it really weighs'
 

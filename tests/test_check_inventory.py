@@ -208,7 +208,7 @@ def test_geoms_without_a_name_in_an_included_file_are_told_apart(tmp_path: Path)
     (tmp_path / "parts.xml").write_text(parts, encoding="utf-8")
     case = case_of(written(tmp_path, mjcf('<include file="parts.xml"/>', GOOD_OPTION)))
     model = case.model
-    found = {float(model.geom_pos[g, 0]): case.places.geom(g) for g in range(3)}
+    found = {float(model.geom_pos[g, 0]): case.places.find("geom", g) for g in range(3)}
     places = [(found[x].file, found[x].line) for x in (1.0, 2.0)]
     assert places == [("parts.xml", 2), ("parts.xml", 4)]
 
@@ -224,7 +224,7 @@ def test_an_unnamed_element_behind_a_fusion_has_no_line_of_another(
     case = case_of(written(tmp_path, mjcf(fuse, GOOD_OPTION, world=base)))
     at = int(np.flatnonzero(case.model.body_pos[:, 0] == 9.0)[0])
     text = case.source.path.read_text().splitlines()
-    line = case.places.body(at).line
+    line = case.places.find("body", at).line
     assert (line == 0) if is_fused else ("<body pos='9 0 0'>" in text[line - 1])
 
 
@@ -232,5 +232,5 @@ def test_places_of_a_repeated_element_are_the_line_that_repeats_it() -> None:
     source = read_scene("round_peg")
     places = Places(source, shipped_case("round_peg").model)
     text = source.path.read_text(encoding="utf-8").splitlines()
-    assert '<geom name="sector"' in text[places.geom(5).line - 1]
-    assert places.geom(5).element.startswith("geom 'sector_")
+    assert '<geom name="sector"' in text[places.find("geom", 5).line - 1]
+    assert places.find("geom", 5).element.startswith("geom 'sector_")

@@ -21,7 +21,8 @@ from audit_cases import ScriptedDevice
 from bridge_runs import still, sway
 from cli_cases import Called, one_sentence
 from faults.catalogue import SPECTATOR
-from faults.processes import PATIENCE, STOPS, children, is_alive
+from faults.processes import STOPS, children
+from waiting import PATIENCE, is_alive, until
 
 from hapticbridge.audit import audit
 from hapticbridge.cli import main
@@ -417,9 +418,7 @@ def test_a_signal_at_any_moment_of_start_up_leaves_neither_file_nor_process(
         code, _, err = call(*run, "--record", path)
         is_over.set()
         thread.join(PATIENCE)
-        limit = time.monotonic() + PATIENCE  # a busy machine takes its time to end a killed one
-        while left := set(filter(is_alive, children(os.getpid()))) - set(before):
-            assert time.monotonic() < limit, left
+        until(lambda: not set(filter(is_alive, children(os.getpid()))) - set(before))
         assert not any(map(np.any, device.writes))
         if code in {0, 1}:  # it ran
             assert len(read_recording(path).ticks) > 0 and device.is_closed

@@ -21,6 +21,7 @@ import mujoco
 import numpy as np
 import pytest
 from test_grip_axis import Fingers
+from waiting import until
 
 from hapticbridge import (
     Bridge,
@@ -274,10 +275,7 @@ def test_a_loop_that_was_killed_leaves_a_recording_to_audit(tmp_path: Path) -> N
                     if step == 300 + 7 * k:
                         assert device.pid is not None
                         os.kill(device.pid, signal.SIGKILL)
-        end = time.monotonic() + 30.0
-        while read_recording(path).events[-1]["event"] != "bridge_died":
-            assert time.monotonic() < end
-            time.sleep(0.2)
+        until(lambda: read_recording(path).events[-1]["event"] == "bridge_died", 0.2)  # noqa: B023
         report = audit(path)
         assert (report.verdict, report.agreement) == ("passive", "bit for bit")
         assert "the bridge died" in str(report)
@@ -305,14 +303,9 @@ with hapticbridge.DeviceLoop("simulated", recording={str(path)!r}) as device:
     assert program.stdout.readline() == "shown\n"
     program.kill()
     program.communicate()
-    end = time.monotonic() + 30.0
-    while time.monotonic() < end:
-        recording = read_recording(path)
-        if not recording.is_cut:
-            break
-        time.sleep(0.2)
-    assert recording.events[-1]["event"] == "stop"
-    assert recording.events[-1]["reason"] == "program that was killed"
+    until(lambda: not read_recording(path).is_cut, 0.2)
+    last = read_recording(path).events[-1]
+    assert (last["event"], last["reason"]) == ("stop", "program that was killed")
 
 
 def test_the_recording_tells_how_the_program_left(tmp_path: Path) -> None:
@@ -459,9 +452,7 @@ def test_a_program_that_starts_anew_has_the_loop_and_the_other_is_told() -> None
             assert last.pose().position == pytest.approx([0.3, 0.0, 0.0], abs=1e-3)
             first.close()  # a farewell of a program without the loop ends nothing
             last.advance(0.01)
-        end = time.monotonic() + 10.0
-        while len(news) < 4 and time.monotonic() < end:
-            time.sleep(0.01)
+        until(lambda: len(news) >= 4)
         assert news == [False, True, True, "program"]
 
 

@@ -34,6 +34,7 @@ from hapticbridge.run.bridge import Bridge
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
 from page_client import hand
+from waiting import PATIENCE, until
 
 from hapticbridge.view.controls import device_pose
 from hapticbridge.view.window import Address, Window
@@ -122,8 +123,6 @@ def test_the_command_shows_the_view_by_itself(
 
 # The page
 
-PATIENCE = 60.0
-
 
 def test_the_arrows_are_where_the_handle_goes_in_any_frame_and_scale(tmp_path: Path) -> None:
     path = tmp_path / "floor.xml"
@@ -174,13 +173,9 @@ def test_dragging_on_the_page_moves_the_tool_and_the_recording_is_passive(tmp_pa
                 for position in ((0.01,), "here", (float("nan"), 0.0, 0.0), (0.02, 0.0, 0.05)):
                     page.say(type="TransformControlsUpdateMessage", position=position, **turned)
                 state = bridge.session.kernel.bound.state["pose"]
-                while abs(state["tool_position"][0][0] - 0.02) > 1e-3:
-                    assert time.monotonic() < end
-                    time.sleep(0.02)
+                until(lambda: abs(state["tool_position"][0][0] - 0.02) <= 1e-3)
                 page.send("hold button 0", value=True)
-                while bridge.latest_records(1)["buttons"][0] != 1:
-                    assert time.monotonic() < end
-                    time.sleep(0.02)
+                until(lambda: bridge.latest_records(1)["buttons"][0] == 1)
         finally:
             bridge.stop("test")
             thread.join(PATIENCE)

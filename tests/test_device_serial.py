@@ -25,6 +25,7 @@ from emulated.serial_seam import SerialSeam, VirtualPort
 from firmware_build import COMPILER, FIRMWARE, built
 from hypothesis import given
 from hypothesis import strategies as st
+from waiting import until
 
 from hapticbridge.device import SimulatedDevice, open_device
 from hapticbridge.device.driver import ignore_message
@@ -416,13 +417,6 @@ def _board(tmp_path: Path) -> Iterator[Board]:
 @pytest.fixture(name="fast_board")
 def _fast_board(tmp_path: Path) -> Iterator[Board]:
     yield from switched_on(tmp_path, "-DTEENSYDUINO")
-
-
-def until(condition: Any) -> None:
-    end = time.monotonic() + 20.0
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(1e-3)
 
 
 class SlowClock(SystemPorts):

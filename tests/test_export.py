@@ -143,14 +143,7 @@ def test_missing_package_is_told(
     call: Called,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    found = importlib.import_module
-
-    def without(name: str, package: str | None = None) -> Any:
-        if name.split(".", maxsplit=1)[0] == module:
-            raise ImportError(name)
-        return found(name, package)
-
-    monkeypatch.setattr(importlib, "import_module", without)
+    monkeypatch.setitem(sys.modules, module, None)
     code, out, err = call("export", recording, "--format", form)
     assert (code, out) == (2, "")
     assert install_command(extra) in " ".join(err.split())

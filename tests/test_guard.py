@@ -21,6 +21,7 @@ from faults.catalogue import FAULTS, PUSHER
 from faults.rig import Outcome, Rig
 from numpy.typing import NDArray
 from report_runs import ANVIL
+from waiting import until
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
@@ -200,33 +201,14 @@ def test_a_device_catches_up_after_a_silence_and_jumps_at_no_other_time(
 ) -> None:
     begin = 100
 
-    class Link:
+    def pose(tick: int) -> tuple[float, ...]:
         """Device at 0.1 m/s whose link is silent, then gives what waited in it, then the newest."""
+        waited = begin if tick == begin + silent else tick
+        jump = 0.02 if tick > begin + silent else 0.0
+        return (1e-4 * waited + jump, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
-        info = hb.DeviceInfo(name="link", axes=("x",), force_limit=5.0, damping=2.0, is_real=False)
-        tick = 0
-
-        def start(self, period: float) -> NDArray[np.void]:
-            sample = np.zeros(1, hb.SAMPLE_DTYPE)
-            sample["quaternion"][0, 0] = 1.0
-            return sample
-
-        def read(self, sample: NDArray[np.void]) -> int:
-            self.tick += 1
-            is_silent = begin < self.tick <= begin + silent
-            waited = begin + 1 if self.tick == begin + silent + 1 else self.tick
-            jump = 0.02 if self.tick > begin + silent + 1 else 0.0
-            sample["position"][0] = 1e-4 * (begin if is_silent else waited) + jump, 0.0, 0.0
-            sample["quaternion"][0] = 1.0, 0.0, 0.0, 0.0
-            return int(hb.TickFlag.STALE_SAMPLE) if is_silent else 0
-
-        def write(self, wrench: NDArray[np.float64]) -> None:
-            pass
-
-        def close(self) -> None:
-            pass
-
-    with hb.Bridge("point_mass", Link(), clock=hb.SimulatedClock()) as bridge:
+    link = ScriptedDevice(pose, is_stale=lambda tick: begin <= tick < begin + silent)
+    with hb.Bridge("point_mass", link, clock=hb.SimulatedClock()) as bridge:
         if is_refused:
             with pytest.raises(hb.SafetyTrip, match="jumped farther") as stopped:
                 bridge.run(0.5)
@@ -364,9 +346,7 @@ def test_a_killed_process_still_says_zero_and_one_that_closed_does_not(
     assert node.read_bytes() == b""
     process.send_signal(signal.SIGKILL)
     process.wait()
-    limit = time.monotonic() + 20.0
-    while node.read_bytes() != 3 * b"\0zero\1off":
-        assert time.monotonic() < limit, "nobody said zero"
+    until(lambda: node.read_bytes() == 3 * b"\0zero\1off")
     if has_forked:
         os.kill(int(holder), signal.SIGKILL)
     process.stdout.close()

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from audit_cases import ScriptedDevice
 from device_benches import opened_rawhid
 from emulated.hid_seam import DrivingClock, HidSeam, Timed
 from emulated.spacemouse_model import SpaceMouse
@@ -43,39 +45,22 @@ def recorded(path: Path, scene: str = "bar", seconds: float = 1.0) -> hb.Summary
         return bridge.run(seconds)
 
 
-class Scripted:
+class Scripted(ScriptedDevice):
     """Device that moves as told and keeps what it was sent."""
 
     def __init__(self, name: str, speed: float, **sheet: Any) -> None:
-        usual = {"damping": 2.0, "rotational_damping": 2e-3, "delay": 0.0, "is_real": False}
-        axes = ("x", "y", "z", "rx", "ry", "rz")
-        self.info = hb.DeviceInfo(name=name, axes=axes, force_limit=10.0, **(usual | sheet))
-        self.speed, self.every, self.ticks, self.last_tick = speed, 1, 0, 1 << 30
-        self.sent: list[NDArray[np.float64]] = []
-        self.is_closed = False
-
-    def start(self, period: float) -> NDArray[np.void]:
-        self.period = period
-        sample = np.zeros(1, hb.SAMPLE_DTYPE)
-        sample["quaternion"][0, 0] = 1.0
-        return sample
+        self.speed, self.every, self.last_tick = speed, 1, 1 << 30
+        super().__init__(
+            lambda tick: (1e-3 * self.speed * tick, 0, 0, 1, 0, 0, 0),
+            is_stale=lambda tick: tick % self.every != 0,
+            name=name,
+            **sheet,
+        )
 
     def read(self, sample: NDArray[np.void]) -> int:
-        if self.ticks >= self.last_tick:
+        if self.tick >= self.last_tick:
             raise DeviceLost(f"the device '{self.info.name}' is gone")
-        is_new = self.ticks % self.every == 0
-        shown = self.ticks - self.ticks % self.every
-        self.ticks += 1
-        sample["position"][0] = self.speed * self.period * shown, 0.0, 0.0
-        sample["quaternion"][0] = 1.0, 0.0, 0.0, 0.0
-        sample["buttons"][0] = 0
-        return 0 if is_new else int(hb.TickFlag.STALE_SAMPLE)
-
-    def write(self, wrench: NDArray[np.float64]) -> None:
-        self.sent.append(wrench.copy())
-
-    def close(self) -> None:
-        self.is_closed = True
+        return super().read(sample)
 
 
 @pytest.mark.parametrize("scene", ["bar", "peg_and_block"])
@@ -115,9 +100,9 @@ def test_scales_and_limits_are_each_hands_own() -> None:
     ]
     with hb.Bridge(two_handed(BAR), hands, clock=clocked()) as bridge:
         bridge.run(1.0)
-    assert max(abs(sent[0]) for sent in still.sent) <= 1.0 + 1e-9
+    assert max(abs(sent[0]) for sent in still.writes) <= 1.0 + 1e-9
     # the bar rests under 1 N from the left, so the right holds 1 N, and its device half of it
-    assert moving.sent[-3][0] == pytest.approx(-0.5, abs=0.01)
+    assert moving.writes[-3][0] == pytest.approx(-0.5, abs=0.01)
 
 
 def test_a_device_with_a_grip_axis_gets_a_row_for_each_of_its_hands_at_zero_force_too() -> None:
@@ -126,7 +111,7 @@ def test_a_device_with_a_grip_axis_gets_a_row_for_each_of_its_hands_at_zero_forc
     zero, wrenches = np.zeros(6), np.arange(18.0).reshape(3, 6)
     group.write(zero)
     group.write(wrenches)
-    zero_sent, sent = zip(one.sent, gripper.sent, strict=True)
+    zero_sent, sent = zip(one.writes, gripper.writes, strict=True)
     assert [each.shape for each in (*zero_sent, *sent)] == [(6,), (2, 6)] * 2
     assert np.array_equal(sent[1], wrenches[1:])
 
@@ -169,8 +154,8 @@ def test_either_device_stops_the_run_and_both_get_zero_force() -> None:
         bridge.run(1.0)
     for device in (left, right):
         assert device.is_closed
-        assert device.sent[-1].tolist() == [0.0] * 6
-        assert device.sent[-3][0] != 0.0 or device is left
+        assert device.writes[-1].tolist() == [0.0] * 6
+        assert device.writes[-3][0] != 0.0 or device is left
 
 
 def test_a_trip_names_the_hand() -> None:
@@ -188,7 +173,7 @@ def test_a_trip_names_the_hand() -> None:
     # the last second, a record per hand and tick, in order
     records = caught.value.records
     assert np.array_equal(records["tick"][::2], records["tick"][1::2])
-    assert left.sent[-1].tolist() == right.sent[-1].tolist() == [0.0] * 6
+    assert left.writes[-1].tolist() == right.writes[-1].tolist() == [0.0] * 6
 
 
 def test_a_tool_that_is_too_heavy_for_both_hands_is_carried() -> None:
@@ -621,7 +606,8 @@ def test_the_command_gives_each_real_device_its_buttons(
 ) -> None:
     scene = tmp_path / "bar.xml"
     scene.write_text(BAR)
-    real = Scripted("real", 0.0, is_real=True, buttons=1)
+    real = Scripted("real", 0.0, is_real=True)
+    real.info = replace(real.info, buttons=1)
     monkeypatch.setattr(
         "hapticbridge.cli.run.device_for",
         lambda scene, name, *rest: real if name == "falcon" else device_for(scene, name, *rest),
@@ -631,7 +617,7 @@ def test_the_command_gives_each_real_device_its_buttons(
     run = ["run", str(scene), *hands, "--duration", "0.3", "--record", str(path)]
     assert main([*run, "--dead-man", "0"]) in (0, 1)  # 1 where a busy machine misses the rate
     capsys.readouterr()
-    assert not np.any(real.sent)  # the button was never pressed
+    assert not np.any(real.writes)  # the button was never pressed
     clutched = [
         has_flag(hb.read_recording(path, hand=hand).ticks, TickFlag.CLUTCH).all() for hand in (0, 1)
     ]

@@ -139,18 +139,6 @@ def test_the_table_is_kept_even_if_reading_it_fails(tmp_path: Path) -> None:
     assert (tmp_path / "unread.csv").read_text(encoding="utf-8").count("\n") == 7
 
 
-@pytest.mark.parametrize("what", ["mujoco", "sources"])
-def test_parts_of_other_code_or_another_mujoco_are_refused(tmp_path: Path, what: str) -> None:
-    with ThreadPoolExecutor(1) as pool:
-        run_map(SQUARES, tmp_path, workers=pool)
-        path = tmp_path / "squares.parts"
-        first, *rest = path.read_text(encoding="utf-8").splitlines()
-        found = json.dumps(json.loads(first) | {what: "older"})
-        path.write_text("\n".join([found, *rest, ""]), encoding="utf-8")
-        with pytest.raises(StudyError, match="other sources or another MuJoCo"):
-            run_map(SQUARES, tmp_path, workers=pool)
-
-
 def test_an_unstable_loop_is_unstable_whatever_its_environment() -> None:
     names = np.array(["strict", "active", "within slack", "strict"], dtype=object)
     numbers = verdict_numbers([True, True, True, False], names)

@@ -4,32 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from adversary import UNPAID, Attack, turn
+from adversary import UNPAID, Attack
 from numpy.typing import NDArray
 
 from hapticbridge import Bridge, BridgeOptions, SimulatedClock, Summary, Workspace, audit
 from hapticbridge.audit import AuditReport
-from hapticbridge.coupling import Coupling
-from hapticbridge.demand.methods import method_named, unguarded_parameters
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.parameters import GuardParameters
 from hapticbridge.kernel.record import POST_DTYPE, SAMPLE_DTYPE, TickFlag
-from hapticbridge.kernel.state import BoundKernel
-from hapticbridge.kernel.tick import posted_tick
 from hapticbridge.recording import read_recording
 from hapticbridge.recording.format import SHOWN_EVENT
 from hapticbridge.run.commands import Couple, Repeat, Reset, Switch
 from hapticbridge.run.endpoint import posted_scene, program_options
 from hapticbridge.run.posted_scene import is_post
-from hapticbridge.theory.bounds import minimum_damping
 
 CREDIT = 0.05
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -390,40 +383,6 @@ def test_a_late_force_gives_nothing_while_it_fades_and_rises(
 
     options: dict[str, Any] = {"clutch": 0, "duration": 6.0, "rate": 1000.0}
     assert got_from(holds, ClutchingHand(**late), stiffness, **options) <= UNPAID
-
-
-def test_a_late_torque_gives_nothing_to_a_hand_that_wobbles_about_a_twist() -> None:
-    """The torque of a coupling turns with the hand, a late one does not; 0.5 J were got so."""
-    law, period = Coupling(100.0, 0.0, 1.0, 5e-4), 1e-3
-    b = float(minimum_damping(Coupling(1.0, 5e-4, 0.0, 0.0), period, delay=1.0))
-    scene, method = posted_scene(CREDIT), method_named("implicit")
-    parameters = replace(
-        unguarded_parameters(scene, law, 0.02, 1, method),
-        period=period,
-        force_limit=10.0,
-        torque_limit=5.0,
-        device_damping=1.0,
-        device_rotational_damping=b,
-        scene_ticks=20,
-        credit=CREDIT,
-        guarding=GuardParameters(has_hand=True, stated_delay=period),
-    )
-    kernel = BoundKernel(scene.model, scene.data, parameters)
-    sample, post = np.zeros(1, SAMPLE_DTYPE), post_of((0.0, 0.0, 0.0))
-    place, late, net, most = np.array(UPRIGHT), np.zeros((2, 3)), 0.0, 0.0
-    for tick in range(4000):
-        step = 0.02 * period / b * late[0]  # lets the spring go in the end
-        if tick < 500:
-            step = np.array([0.0, 0.0, 2.6 / 500])
-        elif tick < 2500:
-            step = 0.02 * np.array([math.cos(1.3 * tick), -math.sin(1.3 * tick), 0.0])
-        net += float(late[0] @ step - b / period * step @ step)
-        most = max(most, net)
-        turn(place, step)
-        sample["quaternion"] = place
-        assert posted_tick(kernel.state, sample, post, kernel.row, period)
-        late = np.array([late[1], kernel.wrench_on_device[3:]])
-    assert most <= UNPAID
 
 
 @pytest.mark.parametrize("force_scale", [0.5, 1.0, 3.0])

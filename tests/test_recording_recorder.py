@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from waiting import PATIENCE, has_ended, is_alive, until
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.kernel.record import FORMAT, TICK_DTYPE, TickFlag
@@ -35,7 +36,6 @@ from hapticbridge.recording.recorder_process import LiveLine, RunState
 META = {"method": "implicit", "device": "{}"}
 # larger than what a pipe takes at once
 FILES = (Attachment("model.mjb", "application/octet-stream", bytes(range(256)) * 4000),)
-PATIENCE = 30.0
 
 
 def numbered(start: int, stop: int) -> NDArray[np.void]:
@@ -103,10 +103,7 @@ def test_a_file_holds_no_record_before_the_event_of_its_start(ring: Ring, tmp_pa
     recorder = started(ring, path, META, ())
     rows = numbered(0, 2048)  # eight chunks
     produce(ring, recorder, rows[:1024])
-    limit = time.monotonic() + PATIENCE
-    while ring.pending():
-        assert time.monotonic() < limit
-        time.sleep(0.001)
+    until(lambda: not ring.pending())
     recorder.event({"event": "start"}, 0)
     produce(ring, recorder, rows[1024:])
     recorder.close()
@@ -193,10 +190,7 @@ def test_killed_recorder_is_noticed_and_named(ring: Ring, tmp_path: Path) -> Non
     recorder = started(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
     os.kill(recorder.pid, signal.SIGKILL)
-    limit = time.monotonic() + PATIENCE
-    while recorder.is_alive():
-        assert time.monotonic() < limit
-        time.sleep(0.01)
+    until(lambda: not recorder.is_alive())
     recorder.event({"event": "late"}, 0)
     with pytest.raises(RecordingError, match=r"killed by signal 9.*hapticbridge repair"):
         recorder.close()
@@ -279,14 +273,6 @@ def test_live_line_on_a_terminal_is_redrawn_and_may_break() -> None:
     assert text.count("\n") <= 2
 
 
-def gone(pid: int) -> None:
-    """Waits until a child process has ended."""
-    limit = time.monotonic() + PATIENCE
-    while os.waitpid(pid, os.WNOHANG) == (0, 0):
-        assert time.monotonic() < limit
-        time.sleep(0.001)
-
-
 @pytest.mark.parametrize("has_full_pipe", [False, True])
 def test_a_recorder_that_stands_still_is_left_to_finish(
     ring: Ring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_full_pipe: bool
@@ -306,7 +292,7 @@ def test_a_recorder_that_stands_still_is_left_to_finish(
     recorder.close()
     assert recorder.is_left
     os.kill(recorder.pid, signal.SIGCONT)
-    gone(recorder.pid)
+    until(lambda: has_ended(recorder.pid))
     recording = read_recording(path)
     assert recording.ticks["tick"].tolist() == list(range(600))
     assert not recording.is_cut
@@ -382,12 +368,7 @@ def test_a_recorder_of_a_run_without_a_tick_leaves_no_file_when_the_bridge_dies(
         check=False,
         timeout=PATIENCE,
     )
-    limit = time.monotonic() + PATIENCE
-    while Path(f"/proc/{int(done.stdout)}/cmdline").exists():
-        if not Path(f"/proc/{int(done.stdout)}/cmdline").read_bytes():
-            break  # ended, and not yet waited for
-        assert time.monotonic() < limit
-        time.sleep(0.01)
+    until(lambda: not is_alive(int(done.stdout)))
     assert not path.exists()
 
 

@@ -338,17 +338,6 @@ def test_weight_is_carried_on_request_and_not_as_is(tmp_path: Path) -> None:
         pass
 
 
-def test_force_of_a_motor_is_not_taken_for_weight(tmp_path: Path) -> None:
-    arm = outside.HINGE_TOOL.format(joint="axis='0 0 1'")
-    text = outside.mjcf(
-        "<actuator><motor name='m' joint='elbow'/></actuator>",
-        "<keyframe><key name='home' ctrl='1.5'/></keyframe>",
-        body=arm,
-    )
-    with started(tmp_path, text) as bridge:
-        assert not bridge.scene.is_carried  # 15 N at an arm of 0.1 m, with or without gravity
-
-
 LIFT = """<mujoco><worldbody><body><joint name="lift" type="slide" axis="0 0 1" damping="20" {}/>
 <geom size="0.02" mass="{}"/><site name="grip"/></body></worldbody>
 <actuator><motor joint="lift"/></actuator>

@@ -6,10 +6,10 @@ import os
 import shutil
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
+from waiting import until
 
 ROOT = Path(__file__).parents[1]
 
@@ -74,9 +74,7 @@ def test_after_an_interrupt_the_report_is_written_all_the_same(tmp_path: Path) -
         text=True,
         start_new_session=True,  # a group of its own, as a terminal's foreground has
     )
-    end = time.monotonic() + 60
-    while not (tmp_path / "waiting").exists() and time.monotonic() < end:
-        time.sleep(0.01)
+    until((tmp_path / "waiting").exists)
     os.killpg(process.pid, signal.SIGINT)
     told, _ = process.communicate(timeout=60)
     assert process.returncode == 0

@@ -344,9 +344,15 @@ def test_a_file_of_another_function_or_version_is_refused(tmp_path: Path) -> Non
     sweep(one, points, results=tmp_path / "plus", workers=1)
     with pytest.raises(StudyError, match=r"more=1\.0000000000000002"):
         sweep(two, points, results=tmp_path / "plus", workers=1)
-    path.write_text(path.read_text().replace('"hapticbridge": "', '"hapticbridge": "9'))
-    with pytest.raises(StudyError, match="by hapticbridge 9"):
-        sweep(functions.bound, POINTS, results=path, workers=1)
+    kept = path.read_text()
+    for name, words in (
+        ("hapticbridge", "by hapticbridge 9"),
+        ("mujoco", "or by other sources or another MuJoCo than now"),
+        ("sources", "or by other sources or another MuJoCo than now"),
+    ):
+        path.write_text(kept.replace(f'"{name}": "', f'"{name}": "9'))
+        with pytest.raises(StudyError, match=words):
+            sweep(functions.bound, POINTS, results=path, workers=1)
     path.write_text("[]")
     with pytest.raises(StudyError, match="holds a sweep of None"):
         sweep(functions.bound, POINTS, results=path, workers=1)

@@ -6,7 +6,7 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from hapticbridge.view.window import Address, Window
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
 from page_client import Hand, hand, said
+from waiting import PATIENCE, until
 
 from hapticbridge.view.controls import Controls, Outlet
 from hapticbridge.view.server import serve, stop
@@ -41,16 +42,6 @@ pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptio
 CLUTCH = "clutch (the hand moves alone)"
 K, B = "stiffness K (N/m)", "damping B (N s/m)"
 KR, BR = "turning stiffness K_r (N m/rad)", "turning damping B_r (N m s/rad)"
-
-PATIENCE = 60.0
-"""Time limit in s for anything to happen in a run, which ends after twice as long."""
-
-
-def until(condition: Callable[[], Any]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 @contextlib.contextmanager

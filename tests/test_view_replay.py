@@ -27,7 +27,8 @@ from hapticbridge.view.window import Address
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
 import msgspec
-from page_client import PATIENCE, hand, said
+from page_client import hand, said
+from waiting import PATIENCE
 
 from hapticbridge.view.page import Sight
 from hapticbridge.view.replay import Replay, Theatre

@@ -17,7 +17,8 @@ from hapticbridge.view.window import Address
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
 import websockets.exceptions
-from page_client import PATIENCE, hand
+from page_client import hand
+from waiting import PATIENCE
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 

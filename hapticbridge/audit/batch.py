@@ -15,7 +15,7 @@ import numpy as np
 from hapticbridge.audit import audit
 from hapticbridge.confinement import ForeignSceneError
 from hapticbridge.errors import RecordingError, StudyError, choices
-from hapticbridge.files import check_target, finite_or_null, name_fault, reason_of
+from hapticbridge.files import check_target, finite_or_null, name_fault, writing
 from hapticbridge.recording.reader import foreign_file
 from hapticbridge.sweep import Interrupted, Table, Value, Workers, check_format, sweep
 
@@ -187,10 +187,8 @@ def write_audits(table: Table, path: Path) -> None:
         return
     values = {name: column.tolist() for name, column in columns.items()}
     rows = [dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]
-    try:
+    with writing(path, StudyError):
         path.write_text(json.dumps(finite_or_null(rows), indent=1, allow_nan=False) + "\n", "utf-8")
-    except OSError as error:
-        raise StudyError(f"cannot write '{path}': {reason_of(error, path)}") from None
 
 
 def worst_exit_code(table: Table) -> int:

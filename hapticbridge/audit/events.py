@@ -216,12 +216,7 @@ class AuditedRun:
         linear, angular = (
             max(couplings, key=partial(demand, axis=axis)) for axis in ("translation", "rotation")
         )
-        coupling = replace(
-            linear,
-            rotational_stiffness=angular.rotational_stiffness,
-            rotational_damping=angular.rotational_damping,
-        )
-        return replace(run, coupling=coupling)
+        return replace(run, coupling=linear.with_axis("rotation", *angular.gains("rotation")))
 
     @property
     def delay(self) -> int:

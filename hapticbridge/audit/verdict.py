@@ -559,18 +559,14 @@ class JudgedDevice:
             RecordingError: Their numbers are beyond the range of the theory.
         """
         run, recording = hand.run, hand.recording
-        info, method, parameters = run.info, run.method, run.parameters
-        where_felt = parameters.grip, parameters.scale, parameters.force_scale
+        info, method = run.info, run.method
         try:
-            coupling = RunCoupling.of(
+            coupling = RunCoupling.of_run(
                 method,
-                parameters.timestep,
                 requested_of(recording.meta),
-                law=parameters.coupling,
-                measured=parameters.effective,
-                is_always_implicit=not parameters.scene_ticks
-                and was_never_lossless(recording.count, recording.flags),
-            ).felt_at(*where_felt, is_apart=parameters.is_apart)
+                run.parameters,
+                was_never_lossless=was_never_lossless(recording.count, recording.flags),
+            )
             conditions = run_conditions(info, run.worst, method)
             return cls(
                 grip=recording.meta.get("grip", ""),

@@ -50,12 +50,12 @@ def _limits(case: SceneUnderCheck) -> Iterator[Fault]:
         inertia = joint_inertia(model, case.scene.data, int(model.jnt_dofadr[joint]))
         is_slide = bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
         solver = model.jnt_solref[joint], model.jnt_solimp[joint]
-        found.append((case.places.joint(joint), *solver, inertia, is_slide))
+        found.append((case.places.find("joint", joint), *solver, inertia, is_slide))
     can_move = model.tendon_invweight0 > 0
     for tendon in np.flatnonzero(model.tendon_limited & can_move).tolist():
         solver = model.tendon_solref_lim[tendon], model.tendon_solimp_lim[tendon]
         inertia = 1.0 / float(model.tendon_invweight0[tendon])
-        found.append((case.places.tendon(tendon), *solver, inertia, True))
+        found.append((case.places.find("tendon", tendon), *solver, inertia, True))
     for place, solref, solimp, inertia, is_slide in found:
         if _is_soft(case, solref, solimp) and (
             words := _depth_words(case, solref, solimp, inertia, is_slide)
@@ -75,7 +75,7 @@ def _equalities(case: SceneUnderCheck) -> Iterator[Fault]:
             continue
         solref, solimp = model.eq_solref[equality], model.eq_solimp[equality]
         if _is_soft(case, solref, solimp):
-            place = case.places.equality(equality)
+            place = case.places.find("equality", equality)
             softer = contact_numbers(solref, solimp, case.step).softness
             yield Fault(
                 "soft equality",

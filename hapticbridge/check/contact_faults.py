@@ -103,7 +103,7 @@ def shape_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     if boxes:
         yield Fault(
             "box edges",
-            case.places.geom(_tool_geom(boxes[0], is_tool)),
+            case.places.find("geom", _tool_geom(boxes[0], is_tool)),
             f"{pair_names(case, boxes)} are boxes, of whose contact MuJoCo drops points from step "
             "to step where an edge is touched; a peg of 30 g sank 5 mm in that way",
             "--contact rigid for the run, whose boxes keep all points",
@@ -112,7 +112,7 @@ def shape_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         count = max(_corners(model, geom) for pair in meshes for geom in pair)
         yield Fault(
             "mesh faces",
-            case.places.geom(_tool_geom(meshes[0], is_tool)),
+            case.places.find("geom", _tool_geom(meshes[0], is_tool)),
             f"{pair_names(case, meshes)} meet with the normal of either face, up to 84 mrad off "
             "the one that is touched; a tilted tool without friction sank 2.5 mm in that way",
             f"boxes, spheres and capsules instead, or meshes of at most {MAX_VERTICES} corners "
@@ -240,17 +240,19 @@ def _place(case: SceneUnderCheck, pair: tuple[int, int], *, is_soft: bool) -> tu
     model = case.model
     for p in range(model.npair):
         if {int(model.pair_geom1[p]), int(model.pair_geom2[p])} == set(pair):
-            return case.places.pair(p), ""
+            return case.places.find("pair", p), ""
     is_tool = tool_geoms(model, case.scene.grip)
     if model.geom_priority[pair[0]] != model.geom_priority[pair[1]]:
-        return case.places.geom(max(pair, key=lambda geom: model.geom_priority[geom])), ""
+        return case.places.find("geom", max(pair, key=lambda geom: model.geom_priority[geom])), ""
     softness = [_softness(model.geom_solref[geom]) for geom in pair]
     if softness[0] == softness[1]:
         own, other = pair if is_tool[pair[0]] else pair[::-1]
-        also = case.places.geom(other)
-        return case.places.geom(own), f" there and at {also.file}:{also.line}, {also.element}"
+        also = case.places.find("geom", other)
+        return case.places.find(
+            "geom", own
+        ), f" there and at {also.file}:{also.line}, {also.element}"
     extreme = max(softness) if is_soft else min(softness)
-    return case.places.geom(pair[softness.index(extreme)]), ""
+    return case.places.find("geom", pair[softness.index(extreme)]), ""
 
 
 def _softness(solref: np.ndarray) -> float:
@@ -262,7 +264,7 @@ def _softness(solref: np.ndarray) -> float:
 
 def pair_names(case: SceneUnderCheck, pairs: list[tuple[int, int]]) -> str:
     """Returns the names of the first pair of geoms, and the number of further pairs."""
-    first, second = (case.places.geom(geom).element for geom in pairs[0])
+    first, second = (case.places.find("geom", geom).element for geom in pairs[0])
     return f"{first} with {second}{others(len(pairs) - 1)}"
 
 
@@ -275,8 +277,10 @@ def margin_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
         return
     meeting = {geom for first, second, _ in settings_among(model) for geom in (first, second)}
-    found = [(places.geom(geom), float(model.geom_margin[geom])) for geom in sorted(meeting)]
-    found += [(places.pair(p), float(model.pair_margin[p])) for p in range(model.npair)]
+    found = [
+        (places.find("geom", geom), float(model.geom_margin[geom])) for geom in sorted(meeting)
+    ]
+    found += [(places.find("pair", p), float(model.pair_margin[p])) for p in range(model.npair)]
     does = "it pushes that far before it is touched, and the force jumps where it begins"
     if case.is_rigid:
         does = (
@@ -330,7 +334,7 @@ def start_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             )
         yield Fault(
             "starts in contact",
-            case.places.geom(mover),
+            case.places.find("geom", mover),
             f"{pair_names(case, [(first, second)])} overlap by {length(-contact.dist)} at the "
             f"start; {effect}",
             _moved_out(case, body, out),

@@ -48,8 +48,8 @@ def mesh_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         dent, filled = dent_of(vertices, faces)
         if dent <= DEEPEST_DENT * float(np.ptp(vertices, axis=0).max()):
             continue
-        place = case.places.geom(geom)
-        mesh_place = case.places.mesh(mesh)
+        place = case.places.find("geom", geom)
+        mesh_place = case.places.find("mesh", mesh)
         more = f" and {number(1e6 * filled)} cm³ of air are filled" if filled > 0 else ""
         yield Fault(
             "mesh not convex",
@@ -97,7 +97,7 @@ def grip_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     scene.reset()
     site = model.site(scene.grip).id
     for clause in scene.held:
-        yield Fault("held grip", case.places.site(site), clause, LET_GO)
+        yield Fault("held grip", case.places.find("site", site), clause, LET_GO)
     tool_bodies, body = case.tool_bodies, int(model.site_bodyid[site])
     mass = model.body_mass[tool_bodies]
     if not mass.sum() > 0 or tool_bodies[list(case.refused)].any():
@@ -111,7 +111,7 @@ def grip_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     rotation = scene.data.xmat[body].reshape(3, 3)
     offset = np.round(rotation.T @ (centre - scene.data.xpos[body]), 6) + 0.0  # no -0
     local = " ".join(f"{v:.4g}" for v in offset)
-    place = case.places.site(site)
+    place = case.places.find("site", site)
     yield Fault(
         "far grip",
         place,

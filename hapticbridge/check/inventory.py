@@ -205,7 +205,7 @@ def _idle(
     tree = model.body_treeid
     reached = reached_trees(model, tool, met)
     idle = [
-        Idle(places.body(body), f"never touches the tool, nor what moves it{when}")
+        Idle(places.find("body", body), f"never touches the tool, nor what moves it{when}")
         for body in range(1, model.nbody)
         if tree[body] >= 0 and int(tree[body]) not in reached
     ]
@@ -218,8 +218,8 @@ def _idle(
     for geom, use in enumerate(uses):
         group = int(tree[model.geom_bodyid[geom]])
         if use == VISUAL:
-            idle.append(Idle(places.geom(geom), VISUAL))
+            idle.append(Idle(places.find("geom", geom), VISUAL))
         elif not model.nflex and geom not in touched and (group < 0 or group in reached):
             still = "fixed and never met" if group < 0 else "never meets anything"
-            idle.append(Idle(places.geom(geom), f"{still}{when}"))
+            idle.append(Idle(places.find("geom", geom), f"{still}{when}"))
     return tuple(idle)

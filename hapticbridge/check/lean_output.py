@@ -14,7 +14,7 @@ from hapticbridge.check.perception import FeltError
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.errors import SceneError
-from hapticbridge.files import check_target, reason_of
+from hapticbridge.files import check_target, reason_of, refuse_existing
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.scene import SceneSource, read_scene
 from hapticbridge.scene.handle import set_step
@@ -86,8 +86,7 @@ def check_lean_target(source: SceneSource, path: Path, *, overwrite: bool = Fals
     if path.resolve() in {file.resolve() for file in _files(source)}:
         raise SceneError(f"'{path}' is a file of the scene itself; choose another name")
     check_target(path, SceneError)
-    if path.exists() and not overwrite:
-        raise SceneError(f"'{path}' exists; choose another file or add --overwrite")
+    refuse_existing(path, SceneError, overwrite=overwrite)
 
 
 def write_lean(lean: Lean, path: Path, *, overwrite: bool = False) -> VariantVerdict:

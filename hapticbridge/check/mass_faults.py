@@ -34,7 +34,7 @@ usual coupling they are a quarter of the usual force and torque limits, 2.4 N an
 def mass_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields missing, unintended and mismatched masses."""
     for body, refusal in case.refused.items():
-        place = case.places.body(body)
+        place = case.places.find("body", body)
         is_none = "mass and" in refusal
         what = "a mass and inertia > 0" if is_none else "inertias with A + B >= C"
         mend = 'mass="…" in one of its geoms, or <inertial pos="0 0 0" mass="…" diaginertia="…"/>'
@@ -82,7 +82,7 @@ def _default_densities(case: SceneUnderCheck) -> Iterator[Fault]:
 def _made_of_water(
     case: SceneUnderCheck, body: int, geoms: list[int], kind: str, change: str
 ) -> Fault:
-    place, name = case.places.geom(geoms[0]), case.places.body(body).element
+    place, name = case.places.find("geom", geoms[0]), case.places.find("body", body).element
     made = "has neither mass nor density and so is made of water"
     if len(geoms) > 1:
         made = "have neither mass nor density and so are made of water"
@@ -103,7 +103,7 @@ def _sets_no_mass(case: SceneUnderCheck, geom: int, written: Any) -> bool:
         and written.density == WATER
         and low <= written.group <= high
         and not written.parent.explicitinertial
-        and not case.places.may_set("geom", "density", case.places.geom(geom))
+        and not case.places.may_set("geom", "density", case.places.find("geom", geom))
     )
 
 
@@ -117,7 +117,9 @@ def _contact_ratios(case: SceneUnderCheck) -> Iterator[Fault]:
         if min(inverse) <= 0 or max(inverse) <= MAX_RATIO * min(inverse) or key in reported:
             continue
         reported.add(key)
-        light, heavy = (case.places.body(bodies[inverse.index(f(inverse))]) for f in (max, min))
+        light, heavy = (
+            case.places.find("body", bodies[inverse.index(f(inverse))]) for f in (max, min)
+        )
         least = 1.0 / (MAX_RATIO * min(inverse))
         yield Fault(
             "mass ratio",
@@ -141,7 +143,7 @@ def _load_ratios(case: SceneUnderCheck) -> Iterator[Fault]:
             continue
         load = float(model.body_subtreemass[body])
         if load > MAX_RATIO * own:
-            place, name = case.places.body(parent), case.places.body(body).element
+            place, name = case.places.find("body", parent), case.places.find("body", body).element
             yield Fault(
                 "mass ratio",
                 place,
@@ -199,7 +201,7 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
         what, where = "the tool, with what is tied to it,", f"{where}, and in those tied to it"
     yield Fault(
         "heavy tool",
-        case.places.body(int(of_tool[0])),  # the first that moves
+        case.places.find("body", int(of_tool[0])),  # the first that moves
         f"{what} weighs {weight(mass)}; where no contact, limit or dry friction carries it, the "
         f"hand carries {' and '.join(parts)} at rest; a run carries it where the device cannot, "
         "and with --no-tool-weight",

@@ -83,7 +83,7 @@ def _falling_bodies(case: SceneUnderCheck, seen: Observation) -> Iterator[Fault]
         moved = seen.postures[-1, address : address + 3] - seen.postures[0, address : address + 3]
         fallen = float(moved @ gravity / np.linalg.norm(gravity))
         if fallen > FALLING * far:
-            place = case.places.body(int(model.jnt_bodyid[joint]))
+            place = case.places.find("body", int(model.jnt_bodyid[joint]))
             yield Fault(
                 "falling body",
                 place,
@@ -111,7 +111,7 @@ def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:
     if not seen.meetings or case.is_rigid:
         return _created_without_contact(case, kind, sentence)
     pair = max(seen.meetings, key=lambda each: seen.meetings[each].force)
-    one, other = (case.places.geom(geom) for geom in pair)
+    one, other = (case.places.find("geom", geom) for geom in pair)
     return Fault(
         kind,
         one,
@@ -124,7 +124,7 @@ def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:
 def _created_by_jump(case: SceneUnderCheck, seen: Observation, kind: str, used: str) -> Fault:
     """Names the tendon with the largest jump: what stretches it at once does no work for that."""
     tendon = max(seen.jumps, key=lambda each: seen.jumps[each])
-    place = case.places.tendon(tendon)
+    place = case.places.find("tendon", tendon)
     return Fault(
         kind,
         place,
@@ -142,5 +142,5 @@ def _created_without_contact(case: SceneUnderCheck, kind: str, sentence: str) ->
         change, place = "slower springs and actuators", case.places.option("integrator")
     else:
         change = f'damping="{LITTLE_DAMPING:g}" or more there, or slower springs and actuators'
-        place = case.places.joint(int(tool_joints[0]))
+        place = case.places.find("joint", int(tool_joints[0]))
     return Fault(kind, place, sentence, change)

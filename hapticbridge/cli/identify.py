@@ -23,7 +23,7 @@ from hapticbridge.device import AXES, DeviceInfo, open_device
 from hapticbridge.device.base import checked_close
 from hapticbridge.device.profile import Profile, own_folder
 from hapticbridge.errors import HapticBridgeError, choices
-from hapticbridge.files import NO_HOME, reason_of
+from hapticbridge.files import NO_HOME, writing
 from hapticbridge.identify import Identification, identify
 from hapticbridge.identify.fit import CONFIDENCE
 from hapticbridge.identify.identify import (
@@ -336,11 +336,9 @@ class Identify:
 def _write(profile: Profile, path: Path) -> str:
     """Writes a profile; returns where the file that it replaces was moved to, or nothing."""
     former = ""
-    try:
+    with writing(path, HapticBridgeError):
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_file():
             former = str(path.replace(path.with_name(f"{path.name}.old")))
         path.write_text(profile.to_toml(), encoding="utf-8")
-    except OSError as error:
-        raise HapticBridgeError(f"cannot write '{path}': {reason_of(error, path)}") from None
     return former

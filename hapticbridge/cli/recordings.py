@@ -12,7 +12,7 @@ from typing import Literal
 from hapticbridge.arguments import option, shared
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress
 from hapticbridge.errors import RecordingError, choices
-from hapticbridge.files import atomic_write, check_target
+from hapticbridge.files import atomic_write, check_target, refuse_existing
 from hapticbridge.recording import read_recording
 from hapticbridge.replay.film import USUAL_SHOT, Shot, draw
 from hapticbridge.tools.compare import Comparison, Difference, compare
@@ -75,8 +75,7 @@ class View:
         if path.suffix.lower() != ".html":
             raise RecordingError(f"--save is '{path}'; the page must end in .html")
         check_target(path, RecordingError)
-        if path.exists() and not self.overwrite:
-            raise RecordingError(f"'{path}' exists; choose another file or add --overwrite")
+        refuse_existing(path, RecordingError, overwrite=self.overwrite)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,8 +107,7 @@ class Render:
     def execute(self) -> int:
         """Draws; returns the exit code."""
         check_target(self.output, RecordingError)
-        if self.output.exists() and not self.overwrite:
-            raise RecordingError(f"'{self.output}' exists; choose another file or add --overwrite")
+        refuse_existing(self.output, RecordingError, overwrite=self.overwrite)
         shot = self.shot
         if shot.at is None and self.output.suffix.lower() == ".png":
             from hapticbridge.report import telling_time  # noqa: PLC0415 - imports matplotlib

@@ -43,7 +43,7 @@ from hapticbridge.device.mouse import MouseDevice
 from hapticbridge.device.registry import is_device
 from hapticbridge.device.trajectory import DEFAULT_SECONDS
 from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, choices
-from hapticbridge.files import check_regular, check_target
+from hapticbridge.files import check_regular, check_target, refuse_existing
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
 from hapticbridge.recording.container import refuse_replacing
@@ -379,8 +379,7 @@ def refuse_overwriting(record: Path | None, *devices: str, overwrite: bool) -> N
         return
     check_target(record, RecordingError)
     check_regular(record, RecordingError)
-    if not overwrite:
-        raise RecordingError(f"'{record}' exists; choose another file or add --overwrite")
+    refuse_existing(record, RecordingError, overwrite=overwrite)
     refuse_replacing(record)
     for named in devices:
         motion = Path(named.partition("trajectory:")[2].partition(":/")[0])

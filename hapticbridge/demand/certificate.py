@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
-from hapticbridge.coupling import Axis, Coupling
+from hapticbridge.coupling import PREFIX, UNITS, Axis, Coupling
 from hapticbridge.demand.loop_setting import (
     IN_TIME,
     LoopSetting,
@@ -99,18 +99,15 @@ def default_coupling(
     if info.loop_period is not None:
         share = NEEDED_SHARE / required_damping(Coupling(1.0, 0.0), own_period, lag=lag)
         if info.moves:
-            coupling = replace(coupling, stiffness=share * damping, damping=0.0)
+            coupling = coupling.with_axis("translation", share * damping, 0.0)
         if info.turns:
-            stiffness = share * rotational
-            coupling = replace(coupling, rotational_stiffness=stiffness, rotational_damping=0.0)
+            coupling = coupling.with_axis("rotation", share * rotational, 0.0)
     elif lag != IN_TIME:
-        linear = stiffest_late_coupling(damping, period, lag.delay, lag.ticks_per_sample)
-        coupling = replace(coupling, stiffness=linear[0], damping=linear[1])
+        gains = stiffest_late_coupling(damping, period, lag.delay, lag.ticks_per_sample)
+        coupling = coupling.with_axis("translation", *gains)
         if info.turns:
-            turned = stiffest_late_coupling(rotational, period, lag.delay, lag.ticks_per_sample)
-            coupling = replace(
-                coupling, rotational_stiffness=turned[0], rotational_damping=turned[1]
-            )
+            gains = stiffest_late_coupling(rotational, period, lag.delay, lag.ticks_per_sample)
+            coupling = coupling.with_axis("rotation", *gains)
     shrink = turn = 1.0
     if law_evaluations > 1 and info.loop_period is None:
         needed = required_damping(coupling, period, law_evaluations, lag=lag)
@@ -266,7 +263,7 @@ class DampingCondition:
     @property
     def unit(self) -> str:
         """Unit of the damping."""
-        return "N m s/rad" if self.axis == "rotation" else "N s/m"
+        return UNITS["rotation" if self.axis == "rotation" else "translation"][1]
 
     @property
     def clause(self) -> str:
@@ -386,7 +383,7 @@ def _steps(loop: LoopSetting) -> StepCondition | None:
 
 def _both_lowered(loop: LoopSetting, axis: Axis, share: float) -> str:
     """Returns the words for a share of the law's stiffness and damping, as requested."""
-    prefix, spring, damper = _SETTINGS[axis]
+    prefix, (spring, damper) = PREFIX[axis], UNITS[axis]
     gains = (share * gain for gain in loop.requested(loop.law).gains(axis))
     k, b = (_three_digits(gain) for gain in gains)
     both = f" and the damping to {b} {damper}" if loop.law.gains(axis)[1] > 0.0 else ""
@@ -406,13 +403,13 @@ def _remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
     is_own = loop.info.loop_period is not None
     if loop.law_evaluations == 1 and loop.lag != IN_TIME and not is_own:
         return _late_remedy(loop, axis, available)
-    prefix, spring, damper = _SETTINGS[axis]
+    prefix, (spring, damper) = PREFIX[axis], UNITS[axis]
     parts: tuple[_Part, ...] = ("stiffness", "damping")
     # a faster loop shortens all that a device in time waits for
     is_rate_free = math.isclose(loop.h * loop.law_evaluations, loop.period)
     parts += ("period",) if is_rate_free and loop.lag == IN_TIME else ()
     share = {part: _largest(partial(_bears, loop, axis, available, part)) for part in parts}
-    stiffness, damping = _requested(loop).gains(axis)
+    stiffness, damping = loop.least_requested.gains(axis)
     remedies = []
     if share["stiffness"]:
         limit = _three_digits(share["stiffness"] * stiffness)
@@ -426,7 +423,7 @@ def _remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
     if not remedies:
         return _both_lowered(loop, axis, NEEDED_SHARE * available / loop.needed(axis))
     told = ", or ".join(remedies)
-    if _is_hidden(loop, axis):
+    if loop.is_hidden(axis):
         added = loop.method.compensated_share * share["stiffness"] * stiffness * loop.h
         at_most = _three_digits(added)
         told += f", with a {prefix}damping of at most {at_most} {damper}"
@@ -435,15 +432,14 @@ def _remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
 
 def _late_remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
     """Returns the stiffest coupling that a late device bears, no stiffer than the requested."""
-    prefix, spring, damper = _SETTINGS[axis]
+    prefix, (spring, damper) = PREFIX[axis], UNITS[axis]
     lag, slower = loop.lag, device_period(loop.info, loop.period)
     stiffness, damping = stiffest_late_coupling(
         available / loop.ratio(axis), loop.period, lag.delay, lag.ticks_per_sample
     )
     softer = min(1.0, loop.law.gains(axis)[0] / stiffness)
-    at = prefix.replace(" ", "_")
-    gains = {f"{at}stiffness": softer * stiffness, f"{at}damping": softer * damping}
-    k, b = loop.requested(replace(loop.law, **gains)).gains(axis)
+    law = loop.law.with_axis(axis, softer * stiffness, softer * damping)
+    k, b = loop.requested(law).gains(axis)
     told = (
         f"set the {prefix}stiffness to {_three_digits(k)} {spring} and the {prefix}damping to "
         f"{_three_digits(b)} {damper}"
@@ -453,37 +449,17 @@ def _late_remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
     return told
 
 
-def _is_hidden(loop: LoopSetting, axis: Axis) -> bool:
-    """Returns True if the method took off all requested damping, which may have had any value."""
-    return loop.method.compensated_share > 0.0 and loop.law.gains(axis)[1] == 0.0
-
-
-def _requested(loop: LoopSetting) -> Coupling:
-    """Returns the smallest requested coupling of this law; hidden damping counts as 0."""
-    requested = loop.requested(loop.law)
-    return replace(
-        requested,
-        damping=0.0 if _is_hidden(loop, "translation") else requested.damping,
-        rotational_damping=0.0 if _is_hidden(loop, "rotation") else requested.rotational_damping,
-    )
-
-
 def _bears(loop: LoopSetting, axis: Axis, available: float, part: _Part, share: float) -> bool:
     """Returns True if the device has reserve after one quantity is reduced to a share."""
-    requested, faster = _requested(loop), 1.0
+    requested, faster = loop.least_requested, 1.0
     if part == "period":
         faster = share
     else:
-        name = part if axis == "translation" else f"rotational_{part}"
-        requested = replace(requested, **{name: share * getattr(requested, name)})
+        k, b = requested.gains(axis)
+        gains = (share * k, b) if part == "stiffness" else (k, share * b)
+        requested = requested.with_axis(axis, *gains)
     needed = loop.requesting(requested, faster).needed(axis)
     return needed <= NEEDED_SHARE * available * (1 + _ROUNDING)
-
-
-_SETTINGS: dict[Axis, tuple[str, str, str]] = {
-    "translation": ("", "N/m", "N s/m"),
-    "rotation": ("rotational ", "N m/rad", "N m s/rad"),
-}
 
 
 def _largest(holds: Callable[[float], bool]) -> float:

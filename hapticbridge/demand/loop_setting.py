@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.coupling import Axis, Coupling
+from hapticbridge.coupling import UNITS, Axis, Coupling
 from hapticbridge.demand.methods import IMPLICIT, Method
 from hapticbridge.device.base import DeviceInfo
 from hapticbridge.errors import CouplingError
@@ -277,6 +277,19 @@ class LoopSetting:
     def requested(self, law: Coupling) -> Coupling:
         """Returns the requested coupling of which the method makes a law."""
         return self.method.requested_coupling(law, self.h)
+
+    def is_hidden(self, axis: Axis) -> bool:
+        """Returns True if the method took all requested damping, of any value, off the law."""
+        return self.method.compensated_share > 0.0 and self.law.gains(axis)[1] == 0.0
+
+    @property
+    def least_requested(self) -> Coupling:
+        """Smallest requested coupling of this law; hidden damping counts as 0."""
+        requested = self.requested(self.law)
+        for axis in UNITS:
+            if self.is_hidden(axis):
+                requested = requested.with_axis(axis, requested.gains(axis)[0], 0.0)
+        return requested
 
     def requesting(self, requested: Coupling, faster: float = 1.0) -> LoopSetting:
         """Returns the loop with another requested coupling, and its period times a factor."""

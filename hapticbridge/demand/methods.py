@@ -26,7 +26,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.arguments import Arguments
-from hapticbridge.coupling import Axis, Coupling
+from hapticbridge.coupling import SYMBOLS, UNITS, Axis, Coupling
 from hapticbridge.device.base import AXES, DeviceInfo
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
 from hapticbridge.kernel.codes import (
@@ -202,7 +202,7 @@ class Method:
         References:
             ``theory.bounds``.
         """
-        return self._with_damping(coupling, timestep, law_damping)
+        return _with_damping(coupling, timestep, self.compensated_share, law_damping)
 
     def requested_coupling(self, law: Coupling, timestep: float) -> Coupling:
         """Returns the requested coupling for the law's one: B = B' + compensated_share K h.
@@ -210,20 +210,20 @@ class Method:
         It is also the effective coupling, except for methods that do not subtract their own damping
         (``added_share``).
         """
-        return self._with_damping(law, timestep, effective_damping)
+        return _with_damping(law, timestep, self.compensated_share, effective_damping)
 
-    def _with_damping(
-        self, coupling: Coupling, timestep: float, damping: Callable[..., float]
-    ) -> Coupling:
-        if self.compensated_share == 0.0:
-            return coupling
-        k, b = coupling.stiffness, coupling.damping
-        kr, br = coupling.rotational_stiffness, coupling.rotational_damping
-        return replace(
-            coupling,
-            damping=damping(k, b, timestep, self.compensated_share),
-            rotational_damping=damping(kr, br, timestep, self.compensated_share),
-        )
+
+def _with_damping(
+    coupling: Coupling, timestep: float, share: float, damping: Callable[..., float]
+) -> Coupling:
+    """Returns a coupling with other damping by a function of K, B, time step and share."""
+    if share == 0.0:
+        return coupling
+    return replace(
+        coupling,
+        damping=damping(*coupling.gains("translation"), timestep, share),
+        rotational_damping=damping(*coupling.gains("rotation"), timestep, share),
+    )
 
 
 def require_hazard_consent(method: Method, *, is_real: bool, i_know: bool) -> None:
@@ -240,13 +240,6 @@ def require_hazard_consent(method: Method, *, is_real: bool, i_know: bool) -> No
 
 
 # Coupling of a run under its three names
-
-
-_SYMBOLS: dict[Axis, tuple[str, str, str, str]] = {
-    "translation": ("K", "B", "N/m", "N s/m"),
-    "rotation": ("K_r", "B_r", "N m/rad", "N m s/rad"),
-}
-"""Symbols of stiffness and damping, and their units."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,9 +300,34 @@ class RunCoupling:
         return cls(
             requested,
             law,
-            _acting(law, timestep, method.added_share),
-            _acting(law, timestep, IMPLICIT_SHARE) if is_implicit else None,
+            _with_damping(law, timestep, method.added_share, effective_damping),
+            _with_damping(law, timestep, IMPLICIT_SHARE, effective_damping)
+            if is_implicit
+            else None,
         )
+
+    @classmethod
+    def of_run(
+        cls,
+        method: Method,
+        requested: Coupling,
+        run: RunParameters,
+        *,
+        was_never_lossless: bool,
+    ) -> RunCoupling:
+        """Returns the coupling of a run as its hand feels it.
+
+        ``was_never_lossless`` is True if no tick of the run was lossless.
+        """
+        coupling = cls.of(
+            method,
+            run.timestep,
+            requested,
+            law=run.coupling,
+            measured=run.effective,
+            is_always_implicit=was_never_lossless and not run.scene_ticks,
+        )
+        return coupling.felt_at(run.grip, run.scale, run.force_scale, is_apart=run.is_apart)
 
     def felt_at(
         self, grip: str, scale: float, force_scale: float, *, is_apart: bool = False
@@ -348,7 +366,7 @@ class RunCoupling:
         requested one, which is said.
         """
         turns = info is None or {*info.axes, *info.sensed} & {*AXES[3:]}
-        told = (self._sentence(axis) for axis in _SYMBOLS if axis == "translation" or turns)
+        told = (self._sentence(axis) for axis in SYMBOLS if axis == "translation" or turns)
         return tuple(filter(None, told))
 
     def _sentence(self, axis: Axis) -> str:
@@ -360,7 +378,7 @@ class RunCoupling:
         first = felt or law or asked
         if first is None or first[0] == 0.0:
             return ""
-        k, b, k_unit, b_unit = _SYMBOLS[axis]
+        (k, b), (k_unit, b_unit) = SYMBOLS[axis], UNITS[axis]
 
         def other(gains: tuple[float, float], name: str = b) -> str:
             text = f"{name} = {gains[1]:.4g}"
@@ -380,18 +398,6 @@ class RunCoupling:
             f"{k} = {format_number(first[0])} {k_unit}, "
             f"{name} = {first[1]:.4g} {b_unit}{words}{beside}"
         )
-
-
-def _acting(law: Coupling, timestep: float, share: float) -> Coupling:
-    """Returns the law's coupling with the damping that its integration adds."""
-    damping, rotational = (
-        effective_damping(stiffness, damping, timestep, share)
-        for stiffness, damping in (
-            (law.stiffness, law.damping),
-            (law.rotational_stiffness, law.rotational_damping),
-        )
-    )
-    return replace(law, damping=damping, rotational_damping=rotational)
 
 
 # Rendering methods of the product, and the registry of all methods

@@ -1,9 +1,8 @@
 """Recorder's process: drains the ring into the file, and outlives the bridge.
 
 ``hapticbridge.recording.recorder`` starts it. Its standard input carries one line of JSON, the
-attachments' bytes, one line per event, and ``close`` with the key that signs the file, if any. Its
-answers on standard output are ``ready``, ``full``, ``closed`` or ``error``. If the input ends
-before ``close``, the bridge died.
+attachments' bytes, one line per event, and ``close``. Its answers on standard output are ``ready``,
+``full``, ``closed`` or ``error``. If the input ends before ``close``, the bridge died.
 """
 
 from __future__ import annotations
@@ -221,8 +220,6 @@ class _Session:
             )
         self._live = None
         if configuration["live"]:
-            # imported here, so that a run without a live line starts without it
-
             self._live = LiveLine(sys.stderr, _are_held(configuration["metadata"]))
         self._hands = 1 + len(further_hands(configuration["metadata"]))
         self._batch = BATCH // self._hands * self._hands

@@ -26,7 +26,7 @@ from hapticbridge.arguments import check_fields, option
 from hapticbridge.audit.recorded_scene import load_machine_code, machine_code_for, seconds_for
 from hapticbridge.confinement import MEMORY, Confined, ForeignSceneError, Fresh, Work, Worker
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.files import check_regular, check_target, install_command, reason_of
+from hapticbridge.files import check_regular, check_target, install_command, writing
 from hapticbridge.kernel import jit
 from hapticbridge.kernel.codes import added_actuators
 from hapticbridge.kernel.record import TICK_DTYPE, Timeline
@@ -153,18 +153,18 @@ def draw(
     shot, target = shot or Shot(), Path(out)
     _check_target(target, shot)
     opened = open_recording(recording, 0)
-    try:
-        with tempfile.TemporaryDirectory(
+    with (
+        writing(target, RecordingError),
+        tempfile.TemporaryDirectory(
             prefix=".drawing-", dir=target.absolute().parent, ignore_cleanup_errors=True
-        ) as folder:
-            drawn = Path(folder) / f"drawn{target.suffix.lower()}"
-            child = _Child(opened, shot, progress, drawn, in_process)
-            renderer, reason = child.drawn_with_any(partial(_draw, opened.path, drawn, shot))
-            if reason:
-                raise RecordingError(f"cannot write '{target}': {reason}")
-            drawn.replace(target)
-    except OSError as error:
-        raise RecordingError(f"cannot write '{target}': {reason_of(error, target)}") from None
+        ) as folder,
+    ):
+        drawn = Path(folder) / f"drawn{target.suffix.lower()}"
+        child = _Child(opened, shot, progress, drawn, in_process)
+        renderer, reason = child.drawn_with_any(partial(_draw, opened.path, drawn, shot))
+        if reason:
+            raise RecordingError(f"cannot write '{target}': {reason}")
+        drawn.replace(target)
     return renderer
 
 

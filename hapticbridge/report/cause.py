@@ -19,14 +19,13 @@ from hapticbridge.audit.recorded_scene import bounds_for, compile_recorded
 from hapticbridge.audit.replay import Agreement, Resimulator
 from hapticbridge.confinement import Worker, in_bounds
 from hapticbridge.demand.certificate import DampingCondition, run_conditions
-from hapticbridge.demand.loop_setting import Lag, delay_ticks, required_damping
+from hapticbridge.demand.loop_setting import Lag, LoopSetting, delay_ticks, required_damping
 from hapticbridge.demand.methods import Method
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.run.commands import UNITS
 from hapticbridge.scene.checks import first_pump, unmetered_work
 from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
 from hapticbridge.scene.physics import STEADY_WAY, Lengths
@@ -118,7 +117,7 @@ def _method_cause(method: Method, where: str = "") -> Cause:
 
 def _failing_words(failing: list[DampingCondition]) -> str:
     return "; ".join(
-        f"{c.axis}: the device's damping is {c.available:g} {UNITS[c.axis][1]}, the coupling needs "
+        f"{c.axis}: the device's damping is {c.available:g} {c.unit}, the coupling needs "
         f"{format_number(c.needed)}"
         for c in failing
     )
@@ -149,7 +148,8 @@ def _delay_cause(evidence: Evidence, failing: list[DampingCondition]) -> Cause |
 def _overload_cause(evidence: Evidence, failing: list[DampingCondition]) -> Cause:
     """Returns too stiff a spring for the rate, or too strong a damper, as the cause."""
     worst, own = evidence.worst, evidence.info.damping or 0.0
-    damper = worst.scale * worst.force_scale * evidence.requested.damping
+    loop = LoopSetting.of_run(evidence.info, worst, evidence.method)
+    damper = loop.ratio("translation") * loop.least_requested.damping
     if failing[0].axis == "translation" and damper > NEEDED_SHARE * own:
         return Cause(
             "damping",

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from hapticbridge.audit import AuditReport
 from hapticbridge.audit.energy import energy_balances
 from hapticbridge.audit.events import AuditedRun, AuditState
-from hapticbridge.coupling import Coupling
 from hapticbridge.demand.methods import Method, RunCoupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError
@@ -26,7 +25,7 @@ from hapticbridge.kernel.restitution import MAX_RESTITUTION
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.run.description import method_of, parameters_of, requested_of
-from hapticbridge.run.summary import was_always_implicit
+from hapticbridge.run.summary import was_never_lossless
 
 DRAWABLE = 1e9
 """Largest magnitude in N, m or J that is drawn; a larger one is not physical and breaks the plot's
@@ -47,16 +46,12 @@ def recorded_coupling(recording: Recording) -> RunCoupling:
     Raises:
         RecordingError: The recording does not describe it.
     """
-    meta, parameters = recording.meta, parameters_of(recording.meta)
-    return RunCoupling.of(
+    meta = recording.meta
+    return RunCoupling.of_run(
         method_of(meta),
-        parameters.timestep,
         requested_of(meta),
-        law=parameters.coupling,
-        measured=parameters.effective,
-        is_always_implicit=was_always_implicit(recording.ticks),
-    ).felt_at(
-        parameters.grip, parameters.scale, parameters.force_scale, is_apart=parameters.is_apart
+        parameters_of(meta),
+        was_never_lossless=was_never_lossless(recording.count, recording.flags),
     )
 
 
@@ -104,21 +99,6 @@ class Evidence:
     def events(self) -> list[dict[str, Any]]:
         """Recorded events."""
         return self.recording.events
-
-    @property
-    def requested(self) -> Coupling:
-        """Smallest requested coupling that leads to ``worst``.
-
-        If the law's damping is 0, the method removed all requested damping, which may have had any
-        value up to the effective one. It then counts as 0.
-        """
-        law, step = self.worst.coupling, self.worst.timestep
-        requested = self.method.requested_coupling(law, step)
-        return replace(
-            requested,
-            damping=requested.damping if law.damping else 0.0,
-            rotational_damping=requested.rotational_damping if law.rotational_damping else 0.0,
-        )
 
     @property
     def lateness(self) -> Array:

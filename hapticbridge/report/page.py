@@ -18,7 +18,7 @@ from hapticbridge.demand.own_loop import EVENT as OWN_LOOP_EVENT
 from hapticbridge.demand.pulse import end_words
 from hapticbridge.device import DATA_SHEET_UNITS
 from hapticbridge.errors import RecordingError
-from hapticbridge.files import atomic_write, check_target, read_json, reason_of
+from hapticbridge.files import atomic_write, check_target, read_json, writing
 from hapticbridge.kernel.record import TickFlag, due_times
 from hapticbridge.kernel.restitution import BLOW_SPEED
 from hapticbridge.plotting import inline_svg
@@ -333,11 +333,8 @@ def write_page(path: Path, template: str, **variables: object) -> None:
     )
     environment.filters["quantity"] = format_si
     page = environment.get_template(template).render(variables)
-    try:
-        with atomic_write(path) as draft:
-            draft.write_text(page, encoding="utf-8", errors="backslashreplace")
-    except OSError as error:
-        raise RecordingError(f"cannot write '{path}': {reason_of(error, path)}") from None
+    with writing(path, RecordingError), atomic_write(path) as draft:
+        draft.write_text(page, encoding="utf-8", errors="backslashreplace")
 
 
 # First sentences of a page

@@ -25,11 +25,10 @@ from hapticbridge.arguments import (
     SMALLEST,
     check_fields,
     is_number,
-    rule_of,
     shared,
     shown,
 )
-from hapticbridge.coupling import Axis, Coupling
+from hapticbridge.coupling import PREFIX, UNITS, Axis, Coupling
 from hapticbridge.demand.certificate import StepCondition, assumed_damping
 from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.loop_setting import IN_TIME, LoopSetting
@@ -193,12 +192,6 @@ SOFTEST = 0.05
 """Smallest selectable stiffness as a share of the largest, without unit. A softer coupling no
 longer shows the hand where the tool is. A run that began softer may stay so."""
 
-_GAINS = [rule_of(each).unit for each in fields(Coupling)]
-UNITS = {"translation": (_GAINS[0], _GAINS[1]), "rotation": (_GAINS[2], _GAINS[3])}
-"""Units of stiffness and damping by kind of axis."""
-
-_PREFIX = {"translation": "", "rotation": "rotational "}
-
 _HALVINGS = 60
 """Number of bisections of a limit; more exceed the 53 bits of a double."""
 
@@ -228,12 +221,6 @@ class AxisCouplingLimits:
     run: CouplingLimits
 
     @property
-    def names(self) -> tuple[str, str]:
-        """Names of stiffness and damping in ``Coupling``."""
-        prefix = _PREFIX[self.axis].replace(" ", "_")
-        return f"{prefix}stiffness", f"{prefix}damping"
-
-    @property
     def leverage(self) -> float:
         """Factor s from the tool's to the device's coupling."""
         return self.run.loop.ratio(self.axis)
@@ -242,15 +229,6 @@ class AxisCouplingLimits:
     def damping(self) -> float:
         """Device damping b in N s/m or N m s/rad, or the assumed one."""
         return assumed_damping(self.run.loop.info)[self.axis == "rotation"]
-
-    def gains(self, coupling: Coupling) -> tuple[float, float]:
-        """Returns the stiffness and damping of a coupling along these axes."""
-        stiffness, damping = (float(getattr(coupling, name)) for name in self.names)
-        return stiffness, damping
-
-    def put(self, coupling: Coupling, stiffness: float, damping: float) -> Coupling:
-        """Returns a coupling with other stiffness and damping along these axes."""
-        return replace(coupling, **dict(zip(self.names, (stiffness, damping), strict=True)))
 
     @cached_property
     def _table(self) -> tuple[Array, Array]:
@@ -267,7 +245,7 @@ class AxisCouplingLimits:
         ratios = loop.period * np.array([0.0, *inner, _HIGHEST])
         needs = []
         for ratio in ratios.tolist():
-            at = replace(loop, law=self.put(self.run.start, 1.0, ratio))
+            at = replace(loop, law=self.run.start.with_axis(self.axis, 1.0, ratio))
             try:
                 needs.append(at.needs()[self.axis == "rotation"])
             except CouplingError:  # the delay is beyond what the theory takes
@@ -293,11 +271,11 @@ class AxisCouplingLimits:
         It is inf where friction does not hold the encoder's steps. It takes microseconds after the
         first call, because a refusal must not slow the loop.
         """
-        requested = self.put(self.run.start, stiffness, damping)
+        requested = self.run.start.with_axis(self.axis, stiffness, damping)
         steps = self.steps(requested)
         if steps is not None and (steps.needed or 0.0) > self.friction * (1.0 + 1e-9):
             return math.inf
-        stiffness, damping = self.gains(self.run.law(requested))
+        stiffness, damping = self.run.law(requested).gains(self.axis)
         ratios, needs = self._table
         highest = float(ratios[-1])
         ratio = min(damping / stiffness, highest) if stiffness > 0.0 else highest
@@ -330,7 +308,7 @@ class AxisCouplingLimits:
         reach = self.leverage * (limits.stretch if is_linear else limits.angle)
         stiffest = self.max_stiffness(0.0)
         softest = min(max(SOFTEST * stiffest, effort / reach), stiffest)
-        return min(softest, self.gains(self.run.start)[0])
+        return min(softest, self.run.start.gains(self.axis)[0])
 
     def check(self, stiffness: float, damping: float) -> None:
         """Refuses gains that the device does not allow.
@@ -338,7 +316,7 @@ class AxisCouplingLimits:
         Raises:
             CommandError: The message names the excessive value and the bound.
         """
-        (unit, damper), prefix = UNITS[self.axis], _PREFIX[self.axis]
+        (unit, damper), prefix = UNITS[self.axis], PREFIX[self.axis]
         least = self.min_stiffness
         if stiffness < least * (1.0 - 1e-9):
             raise CommandError(
@@ -346,7 +324,7 @@ class AxisCouplingLimits:
                 "longer feels where the tool is, or the run stops before the force is full"
             )
         needed = self.needed(stiffness, damping)
-        steps = self.steps(self.put(self.run.start, stiffness, damping))
+        steps = self.steps(self.run.start.with_axis(self.axis, stiffness, damping))
         if steps is not None and needed == math.inf:
             has = f"{steps.available:.3g} N" if steps.available else "none"
             raise CommandError(
@@ -408,11 +386,11 @@ class CouplingLimits:
 
     def requested(self, command: Couple, now: Coupling) -> Coupling:
         """Returns the requested coupling after a command; omitted gains keep their values."""
-        requested = self.translation.put(now, command.stiffness, command.damping)
+        requested = now.with_axis("translation", command.stiffness, command.damping)
         stiffness, damping = command.rotational_stiffness, command.rotational_damping
         if self.rotation is None or stiffness is None or damping is None:
             return requested
-        return self.rotation.put(requested, stiffness, damping)
+        return requested.with_axis("rotation", stiffness, damping)
 
     def law(self, requested: Coupling) -> Coupling:
         """Returns the law's coupling for a requested one."""

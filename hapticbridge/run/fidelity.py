@@ -28,7 +28,7 @@ from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.scene import Scene, SceneSource, plain_model
 from hapticbridge.scene.checks import ancestors
 from hapticbridge.scene.compile import reset
-from hapticbridge.scene.handle import copy_values
+from hapticbridge.scene.handle import constraint_rows, copy_values
 from hapticbridge.scene.rehearsal import holding_wrench
 from hapticbridge.scene.start import constraint_name
 from hapticbridge.units import format_degrees, format_si
@@ -473,13 +473,7 @@ def _working(data: mujoco.MjData, body: int, way: NDArray[np.float64]) -> int:
     ``way`` (nv,) is that of the joints from one place to another; -1 if there is no work.
     """
     model = data.model
-    rows = np.zeros((data.nefc, model.nv))
-    if mujoco.mj_isSparse(model) and data.nefc:
-        mujoco.mju_sparse2dense(
-            rows, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
-        )
-    elif data.nefc:
-        rows = data.efc_J.reshape(data.nefc, model.nv)
+    rows = constraint_rows(data)
     chain = np.isin(model.dof_bodyid, ancestors(model, body))
     work = np.abs(data.efc_force * (rows[:, chain] @ way[chain]))
     return int(np.argmax(work)) if work.any() else -1

@@ -63,11 +63,6 @@ def coarse_spring(model: mujoco.MjModel, grip: str, method: Method) -> str:
     return "" if tree.is_never_free else spring_at_the_end(model, tree)
 
 
-def was_always_implicit(ticks: NDArray[np.void]) -> bool:
-    """Returns True if no record of a run was lossless; False without records."""
-    return was_never_lossless(len(ticks), int(np.bitwise_or.reduce(ticks["flags"])))
-
-
 def was_never_lossless(count: int, flags: int) -> bool:
     """Returns True if no record was lossless, by the number of records and their combined flags."""
     return count > 0 and not flags & int(TickFlag.MIDPOINT)
@@ -549,7 +544,6 @@ class Summary:
         )
         peaks: dict[str, Any] = {name: float(state["loop"][name][0]) for name in _PEAKS}
         hand = HandEnergy() if info.is_prescribed else hand_energy(state, parameters)
-        where_felt = parameters.grip, parameters.scale, parameters.force_scale
         certification = certification_of(info, parameters, method, times, hand, outcome.own_loop)
         return cls(
             ticks=outcome.ticks,
@@ -569,16 +563,12 @@ class Summary:
             method=method.name,
             about=method.about,
             hazard=method.hazard,
-            coupling=RunCoupling.of(
+            coupling=RunCoupling.of_run(
                 method,
-                parameters.timestep,
                 requested,
-                law=parameters.coupling,
-                measured=parameters.effective,
-                is_always_implicit=outcome.ticks > 0
-                and not parameters.scene_ticks
-                and not state["lossless"]["ticks"][0],
-            ).felt_at(*where_felt, is_apart=parameters.is_apart),
+                parameters,
+                was_never_lossless=outcome.ticks > 0 and not state["lossless"]["ticks"][0],
+            ),
             fault=_fault(ledger, state, certification),
             conditions=condition_sentences(info, parameters, method),
             certification=certification,

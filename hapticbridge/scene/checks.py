@@ -6,6 +6,7 @@ import codecs
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -109,7 +110,7 @@ class Pump:
         change: Text to write in the MJCF.
     """
 
-    kind: str
+    kind: Literal["joint", "actuator"]
     number: int
     words: str
     change: str

@@ -23,8 +23,7 @@ def pump_faults(case: CompiledScene) -> Iterator[Fault]:
     """Yields joints and motors that push what moves already: energy without end."""
     case.scene.reset()
     for pump in pumps(case.model, case.scene.data):
-        place = case.places.joint if pump.kind == "joint" else case.places.actuator
-        yield Fault("pump", place(pump.number), pump.words, pump.change)
+        yield Fault("pump", case.places.find(pump.kind, pump.number), pump.words, pump.change)
 
 
 MOTOR_FORCE = 0.1
@@ -60,7 +59,7 @@ def motor_faults(case: CompiledScene) -> Iterator[Fault]:
         name = model.actuator(actuator).name or actuator
         yield Fault(
             "motor",
-            case.places.actuator(actuator),
+            case.places.find("actuator", actuator),
             f"actuator '{name}' pushes {driven_name(model, actuator)} with {number(force)} {unit} "
             "from the start on; no guarantee covers what a motor gives the hand",
             _motor_change(model, data, actuator, is_alone=len(own) == 1),
@@ -163,7 +162,7 @@ def unit_faults(case: CompiledScene) -> Iterator[Fault]:
         and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
     ]
     body = int(model.body_rootid[model.site(case.scene.grip).bodyid[0]])
-    place = case.places.mesh(meshes[0]) if meshes else case.places.body(body)
+    place = case.places.find("mesh", meshes[0]) if meshes else case.places.find("body", body)
     change = 'scale="0.001 0.001 0.001"' if meshes else "its sizes and positions in m, kg"
     yield Fault(
         UNITS,
@@ -182,7 +181,7 @@ def angle_faults(case: CompiledScene) -> Iterator[Fault]:
         if not is_hinge or not model.jnt_limited[joint]:
             continue
         low, high = (float(limit) for limit in model.jnt_range[joint])
-        place = case.places.joint(joint)
+        place = case.places.find("joint", joint)
         if is_degree and high - low <= NARROWEST_RANGE:
             written = f"{number(np.degrees(low))} to {number(np.degrees(high))}"
             yield Fault(
@@ -249,7 +248,7 @@ def friction_faults(case: CompiledScene) -> Iterator[Fault]:
             continue
         reported.add(joint)
         moved = f"{length(speed)}/s" if is_slide else f"{number(speed)} rad/s"
-        place, unit = case.places.joint(joint), "N" if is_slide else "N m"
+        place, unit = case.places.find("joint", joint), "N" if is_slide else "N m"
         yield Fault(
             "creeping friction",
             place,

@@ -597,6 +597,18 @@ def _mocap_of(model: mujoco.MjModel, equality: int) -> str:
     return str(next(names, ""))
 
 
+def constraint_rows(data: mujoco.MjData) -> NDArray[np.float64]:
+    """Returns the rows of all active constraints, (nefc, nv)."""
+    rows = np.zeros((data.nefc, data.model.nv))
+    if mujoco.mj_isSparse(data.model):
+        mujoco.mju_sparse2dense(
+            rows, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
+        )
+    else:
+        rows[:] = data.efc_J.reshape(rows.shape)
+    return rows
+
+
 def _motions(
     model: mujoco.MjModel, data: mujoco.MjData, grip: str, without: list[int]
 ) -> NDArray[np.float64]:
@@ -604,13 +616,7 @@ def _motions(
     left_out = [*without, *np.flatnonzero(model.eq_type > int(mujoco.mjtEq.mjEQ_TENDON))]
     is_row = data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
     is_row &= ~np.isin(data.efc_id, left_out)
-    rows = data.efc_J
-    if mujoco.mj_isSparse(model):
-        rows = np.zeros((data.nefc, model.nv))
-        mujoco.mju_sparse2dense(
-            rows, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
-        )
-    _, sizes, axes = np.linalg.svd(rows.reshape(data.nefc, model.nv)[is_row])
+    _, sizes, axes = np.linalg.svd(constraint_rows(data)[is_row])
     count = np.count_nonzero(sizes > HELD * sizes.max(initial=0.0))
     jacobian = np.zeros((6, model.nv))
     if (joint := held_joint(model, grip)) >= 0:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 
@@ -36,6 +36,13 @@ _TAGS = {
 
 _LISTS = {"body": "bodies", "equality": "equalities", "mesh": "meshes"}
 """Lists of an MjSpec that are not called after their kind and an s."""
+
+
+_BODIES = {"geom": "geom_bodyid", "joint": "jnt_bodyid"}
+"""Arrays of the model with the body of an element."""
+
+Kind = Literal["geom", "body", "joint", "site", "equality", "tendon", "actuator", "pair", "mesh"]
+"""Kind of an element."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,41 +93,27 @@ class Places:
         }
         self._attached = {name for name, _ in self._files if PurePosixPath(name).name in models}
 
-    def geom(self, geom_id: int) -> Place:
-        """Returns the place of a geom."""
-        return self._find("geom", geom_id, self._owner(int(self._model.geom_bodyid[geom_id])))
-
-    def body(self, body_id: int) -> Place:
-        """Returns the place of a body."""
-        return self._find("body", body_id)
-
-    def joint(self, joint_id: int) -> Place:
-        """Returns the place of a joint."""
-        return self._find("joint", joint_id, self._owner(int(self._model.jnt_bodyid[joint_id])))
-
-    def site(self, site_id: int) -> Place:
-        """Returns the place of a site."""
-        return self._find("site", site_id)
-
-    def equality(self, equality_id: int) -> Place:
-        """Returns the place of an equality constraint."""
-        return self._find("equality", equality_id)
-
-    def tendon(self, tendon_id: int) -> Place:
-        """Returns the place of a tendon."""
-        return self._find("tendon", tendon_id)
-
-    def actuator(self, actuator_id: int) -> Place:
-        """Returns the place of an actuator."""
-        return self._find("actuator", actuator_id)
-
-    def pair(self, pair_id: int) -> Place:
-        """Returns the place of an explicit pair of geoms."""
-        return self._find("pair", pair_id)
-
-    def mesh(self, mesh_id: int) -> Place:
-        """Returns the place of a mesh; an unnamed mesh has the name of its file."""
-        return self._find("mesh", mesh_id)
+    def find(self, kind: Kind, index: int) -> Place:
+        """Returns the place of an element; an unnamed mesh has the name of its file."""
+        tags, name = _TAGS.get(kind, (kind,)), str(getattr(self._model, kind)(index).name)
+        label = f"{kind} '{name}'" if name else f"{kind} {index}{self._owner(kind, index)}"
+        if name and (found := self._first(tags, lambda e: e.attributes.get("name") == name)):
+            return Place(found.file, found.line, label)
+        elements = list(getattr(self._spec, _LISTS.get(kind, f"{kind}s")))
+        if index >= len(elements) or not self._has_numbers_of(kind, elements, index):
+            return Place(self._main, 0, label)
+        if _line(elements[index]):
+            return Place(*self._recorded(elements[index], tags), label)
+        nameless = [k for k, e in enumerate(elements) if not e.name and not _line(e)]
+        included = [
+            (file, element.line)
+            for file, those in self._files[1:]
+            for element in _outside_defaults(those)
+            if element.tag in tags and "name" not in element.attributes
+        ]
+        if index in nameless and len(nameless) == len(included):
+            return Place(*included[nameless.index(index)], label)
+        return Place(self._main, 0, label)
 
     def named(self, tag: str, name: str) -> Place:
         """Returns the place of an element by its tag and name."""
@@ -185,33 +178,15 @@ class Places:
             if element.tag == tag and attribute in element.attributes
         )
 
-    def _owner(self, body_id: int) -> str:
-        if body_id == 0:
+    def _owner(self, kind: Kind, index: int) -> str:
+        """Returns words on the body of an element without a name."""
+        if kind not in _BODIES:
+            return ""
+        body = int(getattr(self._model, _BODIES[kind])[index])
+        if body == 0:
             return " of the world"
-        name = self._model.body(body_id).name
-        return f" of body '{name}'" if name else f" of body {body_id}"
-
-    def _find(self, kind: str, index: int, owner: str = "") -> Place:
-        """Finds an element by its name, its line, or its position among unnamed elements."""
-        tags, name = _TAGS.get(kind, (kind,)), str(getattr(self._model, kind)(index).name)
-        label = f"{kind} '{name}'" if name else f"{kind} {index}{owner}"
-        if name and (found := self._first(tags, lambda e: e.attributes.get("name") == name)):
-            return Place(found.file, found.line, label)
-        elements = list(getattr(self._spec, _LISTS.get(kind, f"{kind}s")))
-        if index >= len(elements) or not self._has_numbers_of(kind, elements, index):
-            return Place(self._main, 0, label)
-        if _line(elements[index]):
-            return Place(*self._recorded(elements[index], tags), label)
-        nameless = [k for k, e in enumerate(elements) if not e.name and not _line(e)]
-        included = [
-            (file, element.line)
-            for file, those in self._files[1:]
-            for element in _outside_defaults(those)
-            if element.tag in tags and "name" not in element.attributes
-        ]
-        if index in nameless and len(nameless) == len(included):
-            return Place(*included[nameless.index(index)], label)
-        return Place(self._main, 0, label)
+        name = self._model.body(body).name
+        return f" of body '{name}'" if name else f" of body {body}"
 
     def _recorded(self, element: Any, tags: tuple[str, ...]) -> tuple[str, int]:
         """Returns file and line of an element whose line MuJoCo recorded; line 0 if in doubt."""
@@ -227,7 +202,7 @@ class Places:
         }
         return (found.pop(), line) if len(found) == 1 else (self._main, 0)
 
-    def _has_numbers_of(self, kind: str, elements: list[Any], index: int) -> bool:
+    def _has_numbers_of(self, kind: Kind, elements: list[Any], index: int) -> bool:
         """Returns False if elements up to this one were fused or dropped by the compiler."""
         names = list[str]()
         with suppress(IndexError):

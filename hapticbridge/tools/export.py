@@ -24,6 +24,7 @@ from hapticbridge.files import (
     import_extra,
     name_fault,
     reason_of,
+    refuse_existing,
 )
 from hapticbridge.kernel.record import (
     FLAG_LEGEND,
@@ -525,8 +526,7 @@ def export(
         if file.exists() and file.samefile(recording.path):
             raise RecordingError(f"'{file}' is the recording itself; choose another file")
         check_regular(file, RecordingError)
-        if file.exists() and not overwrite:
-            raise RecordingError(f"'{file}' exists; choose another file or add --overwrite")
+        refuse_existing(file, RecordingError, overwrite=overwrite)
     piece, count = _piece(recording, span), 0
     columns = _columns(recording, form, part)
     place = target.resolve()

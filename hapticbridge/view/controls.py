@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from hapticbridge.coupling import Coupling
+from hapticbridge.coupling import SYMBOLS, UNITS, Coupling
 from hapticbridge.demand.methods import RunCoupling
 from hapticbridge.device.mouse import REST, Drag, Pose, line_of_drag
 from hapticbridge.errors import CommandError
@@ -32,7 +32,6 @@ from hapticbridge.kernel.pose import (
 )
 from hapticbridge.run.commands import (
     INTERVAL,
-    UNITS,
     AxisCouplingLimits,
     Command,
     Couple,
@@ -61,7 +60,6 @@ finer step cannot be felt, a coarser one can."""
 
 _ROUNDING = 1.0 + 1e-9  # restores 2 from a bound that was computed as 1.9999999999
 
-SYMBOLS = {"translation": ("K", "B"), "rotation": ("K_r", "B_r")}
 _WORDS = {
     "translation": ("stiffness", "damping"),
     "rotation": ("turning stiffness", "turning damping"),
@@ -141,7 +139,7 @@ class Sliders:
         self, gui: viser.GuiApi, span: AxisCouplingLimits, want: Callable[[], None]
     ) -> None:
         self.span = span
-        stiffness, damping = span.gains(span.run.start)
+        stiffness, damping = span.run.start.gains(span.axis)
         self._steps = (
             _step(max(span.max_stiffness(0.0), stiffness)),
             _step(max(span.max_damping(span.min_stiffness), damping)),
@@ -234,7 +232,7 @@ class Controls:
             mark = gui.add_button("mark this moment", visible=is_single)
             self.answer = gui.add_markdown("")
         # state of the run, now or after the waiting commands
-        self._gains = [sliders.span.gains(allowance.start) for sliders in self._sliders]
+        self._gains = [allowance.start.gains(sliders.span.axis) for sliders in self._sliders]
         self._is_forced, self._is_clutched = True, False
         self._force.on_update(by_hand(lambda: self._switch(force=bool(self._force.value))))
         self._clutch.on_update(by_hand(lambda: self._switch(clutch=bool(self._clutch.value))))
@@ -283,7 +281,7 @@ class Controls:
         method, allowance = self._allowance.method, self._allowance
         law = {field.name: float(event[field.name]) for field in fields(Coupling)}
         requested = allowance.loop.requested(Coupling(**law))
-        self._gains = [sliders.span.gains(requested) for sliders in self._sliders]
+        self._gains = [requested.gains(sliders.span.axis) for sliders in self._sliders]
         is_still = time.monotonic() - self._touched > STILL
         for sliders, pair in zip(self._sliders, self._gains, strict=True):
             (sliders.show if is_still else sliders.bound)(*pair)

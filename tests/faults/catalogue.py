@@ -19,6 +19,7 @@ from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
+from waiting import has_ended, until
 
 from faults.rig import CAUSE, PERIOD, PRESS, STALE, FaultyDevice, Outcome, Rig
 from hapticbridge.coupling import Coupling
@@ -274,14 +275,6 @@ def _quantised(rig: Rig) -> None:
     rig.parameters = {"resolution": 5e-5}
 
 
-def _gone(pid: int) -> None:
-    """Waits until a process of this one has ended."""
-    limit = time.monotonic() + 60.0
-    while os.waitpid(pid, os.WNOHANG) == (0, 0):
-        assert time.monotonic() < limit, "the recorder did not end"
-        time.sleep(1e-3)
-
-
 def _stopped_recorder(rig: Rig) -> None:
     """The recorder is stopped and told to go on only when the bridge has ended."""
     recorders: list[int] = []
@@ -294,7 +287,7 @@ def _stopped_recorder(rig: Rig) -> None:
 
     def wake() -> None:
         os.kill(recorders[0], signal.SIGCONT)
-        _gone(recorders[0])
+        until(lambda: has_ended(recorders[0]))
 
     acting(stop)(rig)
     rig.after = wake
@@ -337,7 +330,7 @@ def _stalled_disk(rig: Rig) -> None:
 
     def wake() -> None:
         go.touch()
-        _gone(recorders[0])
+        until(lambda: has_ended(recorders[0]))
 
     def note(bridge: Bridge) -> None:
         recorder = bridge.session.stream.recorder

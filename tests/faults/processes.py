@@ -11,8 +11,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-PATIENCE = 60.0
-"""Longest wait in s for anything that a process does."""
+from waiting import PATIENCE, is_alive
 
 BRIDGE = """
 import os, re, signal, sys, time
@@ -216,9 +215,3 @@ def children(pid: int) -> list[int]:
     """Returns the child processes of a process."""
     tasks = Path(f"/proc/{pid}/task").glob("*/children")
     return [int(child) for task in tasks for child in task.read_text().split()]
-
-
-def is_alive(pid: int) -> bool:
-    """Returns whether a process runs: one that has ended and is not waited for does not."""
-    status = Path(f"/proc/{pid}/stat")
-    return status.exists() and status.read_text().rsplit(")")[-1].split()[0] != "Z"

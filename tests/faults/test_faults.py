@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from audit_cases import ScriptedDevice
+from audit_cases import AnsweringDevice, ScriptedDevice
 from bridge_runs import fast, sway
-from numpy.typing import NDArray
 
 from faults.catalogue import FAULTS, PROBED, PUSHED, PUSHER, RING_FULL, UNSEEN, Fault, passing
 from faults.processes import HANGS, STOPS, Hang, hang, stop_at_start
@@ -21,9 +20,8 @@ from faults.rig import CAUSE, PERIOD, PRESS, Rig
 from hapticbridge.audit import audit
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.demand.guard import USUAL_ENERGY, Limits
-from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import SafetyTrip
-from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import read_recording
 from hapticbridge.run.bridge import Bridge
 
@@ -119,48 +117,26 @@ def test_a_motors_push_is_cut_off_before_it_passes_the_energy_limit(
     assert outcome.last_is_zero
 
 
-class GivesWay:
+class GivesWay(AnsweringDevice):
     """A hand that gives way slowly while a motor pushes, then jumps to the device's full speed.
 
     Attributes:
         given: Largest energy in J that it got beyond what b burnt.
     """
 
-    info = DeviceInfo(
-        name="yielding",
-        axes=("x", "y", "z"),
-        force_limit=10.0,
-        damping=0.2,
-        delay=0.0,
-        is_delay_measured=True,
-        is_real=False,
-    )
-
     def __init__(self, slow_until: float) -> None:
+        super().__init__(self._yield, name="yielding", damping=0.2)
         self._slow_until, self._gives_way = slow_until, False
-        self._force = self._position = self._net = self.given = 0.0
+        self._net = self.given = 0.0
 
-    def start(self, period: float) -> NDArray[np.void]:
-        sample = np.zeros(1, SAMPLE_DTYPE)
-        sample["quaternion"][0, 0] = 1.0
-        return sample
-
-    def read(self, sample: NDArray[np.void]) -> int:
-        self._gives_way = self._gives_way or abs(self._force) > 9.0
-        if self._gives_way:
-            speed = 0.2 if self._net < self._slow_until else self.info.speed_limit
-            step = math.copysign(speed * PERIOD, self._force)
-            self._position += step
-            self._net += self._force * step - 0.2 * step**2 / PERIOD
-            self.given = max(self.given, self._net)
-        sample["position"][0, 0] = self._position
-        return 0
-
-    def write(self, wrench: NDArray[np.float64]) -> None:
-        self._force = float(wrench[0])
-
-    def close(self) -> None:
-        self._force = 0.0
+    def _yield(self, _tick: int, force: float) -> float:
+        self._gives_way = self._gives_way or abs(force) > 9.0
+        if not self._gives_way:
+            return 0.0
+        speed = 0.2 if self._net < self._slow_until else self.info.speed_limit
+        self._net += (abs(force) - 0.2 * speed) * speed * PERIOD
+        self.given = max(self.given, self._net)
+        return math.copysign(speed, force)
 
 
 def given_to_a_hand_that_jumps(scene: Path, slow_until: float, changes: dict[str, Any]) -> float:

@@ -10,7 +10,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from audit_cases import tapped
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -152,23 +151,3 @@ def test_what_once_broke_a_parser_is_read_or_refused(
     name: str, seed: bytes, tmp_path: Path
 ) -> None:
     tried(PARSERS[name], seed, tmp_path)
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    return tapped(tmp_path_factory.mktemp("whole")).read_bytes()
-
-
-@settings(
-    max_examples=75,
-    derandomize=True,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(at=st.floats(0, 1), data=st.binary(min_size=1, max_size=12), cut=st.floats(0.5, 1))
-def test_a_changed_recording_is_read_or_refused(
-    whole: bytes, at: float, data: bytes, cut: float, tmp_path: Path
-) -> None:
-    start = int(at * len(whole))
-    changed = whole[:start] + data + whole[start + len(data) :]
-    tried(recording, changed[: int(cut * len(whole)) or 1], tmp_path)

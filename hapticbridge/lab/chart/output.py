@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from hapticbridge.errors import StudyError
-from hapticbridge.files import finite_or_null, prepared_folder, reason_of
+from hapticbridge.files import finite_or_null, prepared_folder, writing
 from hapticbridge.lab.chart.chart import Chart, Measurement, Order
 from hapticbridge.lab.chart.score import PASSIVE, Panel, Verdict
 from hapticbridge.lab.chart.setting import OWN, Setting, simulator_name
@@ -487,11 +487,8 @@ def write_chart(chart: Chart, paths: Mapping[str, Path]) -> ChartFiles:
         "json": json.dumps(facts, indent=2, allow_nan=False) + "\n",
     }
     for ending, text in texts.items():
-        try:
+        with writing(paths[ending], StudyError):
             paths[ending].write_text(text, encoding="utf-8", newline="")
-        except OSError as error:
-            reason = reason_of(error, paths[ending])
-            raise StudyError(f"cannot write '{paths[ending]}': {reason}") from None
     figure = draw_chart(chart)
     for ending in PICTURES:
         write_picture(figure, paths[ending])

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.device import Hand, Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.files import finite_or_null, prepared_folder, reason_of
+from hapticbridge.files import finite_or_null, prepared_folder, writing
 from hapticbridge.lab.closed_loop import ClosedLoop
 from hapticbridge.lab.maps.twins import ENDINGS, RecordedTwins, Twins
 from hapticbridge.lab.methods import METHODS
@@ -207,11 +207,8 @@ def run_map(
         "twins": twins.facts,
     }
     text = json.dumps(finite_or_null(facts), indent=2, allow_nan=False)
-    try:
+    with writing(files["json"], StudyError):
         files["json"].write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        reason = reason_of(error, files["json"])
-        raise StudyError(f"cannot write '{files['json']}': {reason}") from None
     return MapFiles(files["png"], files[form], files["json"], finding, twins, failed)
 
 

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.files import reason_of
+from hapticbridge.files import writing
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
 
 Relation = Literal["equals", "at most", "at least"]
@@ -191,8 +191,6 @@ def write_walk(sections: Sequence[Section], folder: Path) -> Path:
         has_passed=passed(sections),
     )
     path = folder / PAGE
-    try:
+    with writing(path, HapticBridgeError):
         path.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise HapticBridgeError(f"cannot write '{path}': {reason_of(error, path)}") from None
     return path
