@@ -16,6 +16,7 @@ from check_scenes import (
     KEY,
     LEAPING,
     PLANTS,
+    TWO_SIDED,
     Plant,
     bench,
     case_of,
@@ -949,16 +950,28 @@ def test_convex_pieces_open_the_hole_that_a_hull_fills(tmp_path: Path) -> None:
     assert "mesh not convex" not in kinds(mended)
 
 
-@pytest.mark.parametrize(("geom", "is_told"), [('<geom geom="brim"/>', True), ("", False)])
+BRIM = '<geom geom="brim"/>'
+
+
+@pytest.mark.parametrize(
+    ("body", "rest", "geom", "jumps"),
+    [
+        (LEAPING, "", BRIM, "the length"),
+        (LEAPING, "", "", ""),
+        (TWO_SIDED, 'springlength=".2"', BRIM, "the moment arms"),
+        (TWO_SIDED, 'springlength=".2"', '<geom geom="brim" sidesite="side"/>', ""),
+    ],
+)
 def test_energy_of_a_tendon_that_jumps_is_put_down_to_the_tendon(
-    tmp_path: Path, geom: str, is_told: bool
+    tmp_path: Path, body: str, rest: str, geom: str, jumps: str
 ) -> None:
     path = f'<site site="a"/>{geom}<site site="b"/>'
-    cord = f'<tendon><spatial name="cord" stiffness="100">{path}</spatial></tendon>'
-    found = faults_in(tmp_path, mjcf(GOOD_OPTION, cord, body=LEAPING))
+    cord = f'<tendon><spatial name="cord" stiffness="100" {rest}>{path}</spatial></tendon>'
+    found = faults_in(tmp_path, mjcf(GOOD_OPTION, cord, body=body))
     told = [fault for fault in found if fault.kind in CREATED]
-    assert bool(told) == is_told
+    assert bool(told) == bool(jumps)
     for fault in told:
+        assert fault.sentence.startswith(jumps)
         assert (fault.place.element, "damping" in fault.change) == ("tendon 'cord'", False)
 
 
