@@ -229,3 +229,10 @@ LEAPING = """<body name="pelvis" quat=".7071 .7071 0 0"><site name="a" pos="-.06
   <geom size=".01" mass=".1" contype="0" conaffinity="0"/><site name="grip"/>
   <site name="b" pos=".002 -.054 .0057"/></body></body>"""
 """A tool whose cord from site a to b leaves the brim at once."""
+
+TWO_SIDED = """<site name="a" pos="0 0 -.06"/><site name="side" pos=".05 0 0"/>
+<geom name="brim" size=".03" contype="0" conaffinity="0"/>
+<body name="tool" pos="-.001 0 .06"><joint name="x" type="slide" axis="1 0 0" damping=".5"/>
+  <geom size=".01" mass=".1" contype="0" conaffinity="0"/><site name="grip"/><site name="b"/></body>
+"""
+"""A tool whose cord from site a to b is equally long on either side of the brim where x is 1 mm."""

@@ -16,6 +16,7 @@ from check_scenes import (
     KEY,
     LEAPING,
     PLANTS,
+    TWO_SIDED,
     Plant,
     bench,
     case_of,
@@ -133,6 +134,27 @@ def test_an_impossible_inertia_is_told_with_its_stand_in(tmp_path: Path) -> None
     fault = one_of(plant.kind, found)
     assert "judged with 0.01 kg and 1e-06 kg m²" in fault.sentence
     assert 'balanceinertia="true"' in fault.change
+
+
+@pytest.mark.parametrize(
+    ("fuses", "tip", "grip", "words"),
+    [
+        ("true", "tip", "grip", "element 'tip'"),  # its stand-in would be a part of the tool's
+        ("true", "", "grip", "element ''"),  # fusing changes its number
+        ("false", "tip", "handle", "element 'tip'"),  # grips are listed with their masses
+    ],
+)
+def test_a_stand_in_that_no_fault_can_tell_gives_way_to_mujocos_message(
+    tmp_path: Path, fuses: str, tip: str, grip: str, words: str
+) -> None:
+    """A child of the tool without a joint, as in a URDF, has the impossible inertia."""
+    body = """<body name="tool"><joint type="slide"/><geom size=".01" mass=".1"/>
+        <site name="grip"/><body {}><inertial pos="0 0 0" mass=".1" diaginertia="1 1 9"/></body>
+        </body>""".format(f'name="{tip}"' if tip else "")
+    compiler = f'<compiler fusestatic="{fuses}"/>'
+    path = written(tmp_path, mjcf(GOOD_OPTION, compiler, body=body))
+    with pytest.raises(SceneError, match=rf"inertia must satisfy .*\({words}"):
+        open_case(read_scene(path), grip)
 
 
 @pytest.mark.parametrize(("flag", "names"), [("", ["'plate'", "'ball'"]), ("enable", [])])
@@ -949,16 +971,28 @@ def test_convex_pieces_open_the_hole_that_a_hull_fills(tmp_path: Path) -> None:
     assert "mesh not convex" not in kinds(mended)
 
 
-@pytest.mark.parametrize(("geom", "is_told"), [('<geom geom="brim"/>', True), ("", False)])
+BRIM = '<geom geom="brim"/>'
+
+
+@pytest.mark.parametrize(
+    ("body", "rest", "geom", "jumps"),
+    [
+        (LEAPING, "", BRIM, "the length"),
+        (LEAPING, "", "", ""),
+        (TWO_SIDED, 'springlength=".2"', BRIM, "the moment arms"),
+        (TWO_SIDED, 'springlength=".2"', '<geom geom="brim" sidesite="side"/>', ""),
+    ],
+)
 def test_energy_of_a_tendon_that_jumps_is_put_down_to_the_tendon(
-    tmp_path: Path, geom: str, is_told: bool
+    tmp_path: Path, body: str, rest: str, geom: str, jumps: str
 ) -> None:
     path = f'<site site="a"/>{geom}<site site="b"/>'
-    cord = f'<tendon><spatial name="cord" stiffness="100">{path}</spatial></tendon>'
-    found = faults_in(tmp_path, mjcf(GOOD_OPTION, cord, body=LEAPING))
+    cord = f'<tendon><spatial name="cord" stiffness="100" {rest}>{path}</spatial></tendon>'
+    found = faults_in(tmp_path, mjcf(GOOD_OPTION, cord, body=body))
     told = [fault for fault in found if fault.kind in CREATED]
-    assert bool(told) == is_told
+    assert bool(told) == bool(jumps)
     for fault in told:
+        assert fault.sentence.startswith(jumps)
         assert (fault.place.element, "damping" in fault.change) == ("tendon 'cord'", False)
 
 

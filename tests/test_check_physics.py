@@ -144,3 +144,32 @@ def test_numbers_are_said_as_people_read_them() -> None:
     assert [number(v) for v in (2500.4, 0.03751, 1e7)] == ["2500", "0.0375", "10000000"]
     assert [length(v) for v in (375e-6, 4.2e-3, 3.1)] == ["375 µm", "4.2 mm", "3.1 m"]
     assert [weight(v) for v in (0.0354, 1.2)] == ["35.4 g", "1.2 kg"]
+
+
+POINTS = """<mujoco><worldbody><site name="a" pos="0 0 {reach}"/><site name="s" pos=".05 0 0"/>
+<geom name="brim" size=".03" pos="{brim} 0 0"/><body><joint type="slide" axis="1 0 0"/>
+<geom size=".01"/><site name="b" pos="0 0 .06"/></body></worldbody><tendon><spatial><site site="a"/>
+<geom geom="brim" {side}/><site site="b"/></spatial></tendon></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("reach", "brim", "side", "arms"),
+    [
+        (-0.06, 0.0, "", 2.0),  # the arm turns round where the ways are equally long
+        (-0.06, 0.0, 'sidesite="s"', 0.0),
+        (0.0601, 0.5, "", 0.0),  # the arm turns round in 0.1 mm, and the geom is never met
+        (-0.06, 0.03, "", 0.0),  # the way touches the geom, and leaves it
+    ],
+)
+def test_moment_arms_that_jump_are_told_from_those_that_turn_fast(
+    reach: float, brim: float, side: str, arms: float
+) -> None:
+    model = mujoco.MjModel.from_xml_string(POINTS.format(reach=reach, brim=brim, side=side))
+    data, watch = mujoco.MjData(model), physics.TendonWatch(model)
+    found = []
+    for data.qpos[0] in (-0.0007, 0.0005, 0.0017):
+        found.append(watch.jumps(data))
+    assert [list(each) for each in found] == [[], [0] if arms else [], []]
+    if arms:
+        assert found[1][0].length == 0.0
+        assert found[1][0].arms == pytest.approx(arms, abs=0.05)  # arms differ by 2 % about it

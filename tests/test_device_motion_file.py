@@ -12,8 +12,11 @@ import pytest
 import zstandard
 from audit_cases import recorded
 from cli_cases import Called
+from mcap.records import Chunk
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
+from recording_cases import random_rows
+from recording_cases import write as write_recording
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -240,6 +243,38 @@ def test_a_bag_that_compresses_each_message_is_told(tmp_path: Path) -> None:
     (file,) = bag(tmp_path / "packed", {"/hand": packed}).glob("*.mcap")
     with pytest.raises(DeviceError, match="the bag compresses each message; 'ros2 bag convert'"):
         open_device(f"trajectory:{file}")
+
+
+@pytest.mark.parametrize("kind", ["bag", "recording"])
+def test_a_compression_that_mcap_lacks_is_told(
+    kind: str, tmp_path: Path, call: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The package mcap takes it for none, and its checksum then fails."""
+
+    def packed(*, data: bytes, compression: str, **fields: Any) -> Chunk:
+        return Chunk(data=data[::-1], compression=f"brotli{compression[4:]}", **fields)
+
+    path = tmp_path / "run.mcap"
+    with monkeypatch.context() as patched:
+        patched.setattr("mcap.writer.Chunk", packed)
+        if kind == "bag":
+            with path.open("wb") as file:
+                write_ramp(McapWriter(file))
+        else:
+            write_recording(path, random_rows(500), events=False)
+    told = "its chunks are compressed by 'brotli', and MCAP has 'lz4', 'zstd' and none"
+    topic = "/hand" if kind == "bag" else "/tool_pose"
+    device = "run", "point_mass", "--fast", "--device", f"trajectory:{path}"
+    for asked in (
+        ("audit", path),
+        ("repair", path, tmp_path / "whole.mcap"),
+        ("export", path, "--format", "csv"),
+        ("view", path),
+        device,
+        (*device[:-1], f"{device[-1]}:{topic}"),
+    ):
+        code, _, words = call(*asked)
+        assert (code, words.count(told)) == (2, 1), words
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))

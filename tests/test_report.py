@@ -16,7 +16,7 @@ import pytest
 import report_runs
 from audit_cases import ScriptedDevice, recorded
 from bridge_runs import still
-from check_scenes import GOOD_OPTION, LEAPING
+from check_scenes import GOOD_OPTION, LEAPING, TWO_SIDED
 from chromium import browser
 from outside_scenes import mjcf
 from PIL import Image
@@ -356,6 +356,26 @@ def test_a_tendon_whose_length_jumps_is_named_as_the_cause(tmp_path: Path) -> No
     assert told
     # but for what its speed of 0.1 m/s explains
     assert float(told[1]) == pytest.approx(1e3 * np.abs(np.diff(lengths)).max(), abs=0.2)
+
+
+def test_a_tendon_whose_way_changes_its_side_is_named_as_the_cause(tmp_path: Path) -> None:
+    """The length is steady at the kink; the spring pushes the tool towards it from both sides."""
+    path, scene = tmp_path / "run.mcap", tmp_path / "cord.xml"
+    cord = '<tendon><spatial name="cord" stiffness="500" springlength=".2"><site site="a"/>'
+    cord += '<geom geom="brim"{}/><site site="b"/></spatial></tendon>'
+    verdicts = []
+    for side in ("", ' sidesite="side"'):
+        scene.write_text(mjcf(GOOD_OPTION, cord.format(side), body=TWO_SIDED))
+        with Bridge(str(scene), clock=SimulatedClock(), recording=path) as bridge:
+            bridge.run(duration=0.5)
+        verdicts.append(audit(path))
+        if not side:
+            cause = cause_of(read_recording(path), verdicts[0])
+    assert [report.verdict for report in verdicts] == ["active", "passive"]
+    assert (cause.kind, "sidesite" in cause.remedy) == ("jumping tendon", True)
+    told = re.search(r"the moment arms of tendon 'cord' jumped, by up to (\d+)%", cause.evidence)
+    assert told
+    assert int(told[1]) == pytest.approx(200, abs=3)  # they turn round
 
 
 def test_missed_deadlines_are_the_cause_where_the_device_bears_the_coupling(made: Made) -> None:

@@ -22,7 +22,7 @@ from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
 from hapticbridge.run.summary import Ledger
 from hapticbridge.scene import Scene
-from hapticbridge.scene.physics import Lengths
+from hapticbridge.scene.physics import TendonWatch, WayJump
 
 # Clearance of the tool between opposite walls
 
@@ -294,7 +294,7 @@ class Observation:
         warnings: Number of MuJoCo's warnings by text.
         environment: ``strict``, ``within slack`` or ``active``.
         slack_share: Largest share of the slack that was used, without unit.
-        jumps: Largest jump in m of each tendon that jumped, by id.
+        jumps: Largest jump of each tendon that jumped, by id.
     """
 
     meetings: dict[tuple[int, int], Meeting]
@@ -306,7 +306,7 @@ class Observation:
     warnings: dict[str, int] = field(default_factory=dict)
     environment: str = "strict"
     slack_share: float = 0.0
-    jumps: dict[int, float] = field(default_factory=dict)
+    jumps: dict[int, WayJump] = field(default_factory=dict)
 
 
 def observe(
@@ -332,7 +332,7 @@ def observe(
     types = np.zeros((samples.size, len(_TYPE.__members__)), np.int64)
     postures, every = [], max(samples.size // POSTURES, 1)
     force, full, work, done = np.zeros(samples.size), 0, 0, samples.size
-    jumps, tendons = dict[int, float](), Lengths.of(data)
+    jumps, watch = dict[int, WayJump](), TendonWatch(model)
     for k in range(samples.size):
         if work > MAX_WORK and k >= MIN_TICKS:
             done = k
@@ -348,11 +348,8 @@ def observe(
             types[k, : counted.size] = counted
         if data.ncon:
             _note_contacts(data, model.opt.timestep, meetings, setting.contact == RIGID)
-        if model.ntendon:
-            now = Lengths.of(data)
-            for tendon, size in now.jumps_since(tendons, period).items() if k else ():
-                jumps[tendon] = max(jumps.get(tendon, 0.0), size)
-            tendons = now
+        for tendon, jump in watch.jumps(data).items():
+            jumps[tendon] = max(jumps.get(tendon, jump), jump)
         iterations = data.solver_niter[: max(data.nisland, 1)]
         full += bool(data.nefc) and bool(iterations.max(initial=0) >= model.opt.iterations)
         force[k] = float(np.linalg.norm(row["wrench_on_tool"][0, :3]))

@@ -11,7 +11,7 @@ from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.observe import Observation
 from hapticbridge.scene.checks import unmetered_work
 from hapticbridge.scene.contacts import suggested_solref
-from hapticbridge.scene.fault import Fault, length, number
+from hapticbridge.scene.fault import Fault, number
 from hapticbridge.scene.physics import STEADY_WAY
 from hapticbridge.units import format_count
 
@@ -124,12 +124,12 @@ def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:
 def _created_by_jump(case: SceneUnderCheck, seen: Observation, kind: str, used: str) -> Fault:
     """Names the tendon with the largest jump: what stretches it at once does no work for that."""
     tendon = max(seen.jumps, key=lambda each: seen.jumps[each])
-    place = case.places.find("tendon", tendon)
+    place, jump = case.places.find("tendon", tendon), seen.jumps[tendon]
     return Fault(
         kind,
         place,
-        f"{place.element} jumped by {length(seen.jumps[tendon])} in one tick of the motion, as its "
-        f"way round a geom changed, and energy was created: {used}",
+        f"the {jump.quantity} of {place.element} jumped by {jump.size} in one tick of the motion, "
+        f"as its way round a geom changed, and energy was created: {used}",
         STEADY_WAY,
     )
 

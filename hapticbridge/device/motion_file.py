@@ -25,7 +25,7 @@ from hapticbridge.device.trajectory import (
     Motion,
     first_fault,
 )
-from hapticbridge.errors import DeviceError, choices
+from hapticbridge.errors import DeviceError, RecordingError, choices
 from hapticbridge.units import format_number
 
 # Table in CSV
@@ -342,7 +342,13 @@ def _topics(path: Path) -> Iterator[tuple[str, str]]:
     from mcap.records import Channel, Schema  # noqa: PLC0415
     from mcap.stream_reader import StreamReader  # noqa: PLC0415
 
+    from hapticbridge.recording.container import Container, FileBytes  # noqa: PLC0415
+
     try:
+        # the package mcap takes a compression that it does not know for none
+        with FileBytes(path) as data:
+            if reason := Container(data).foreign_compression():
+                raise DeviceError(f"{path}: cannot be read ({reason})")
         with path.open("rb") as file:
             if index := _index(file):
                 channels, schemas = index.channels.values(), index.schemas
@@ -350,7 +356,7 @@ def _topics(path: Path) -> Iterator[tuple[str, str]]:
                 records = [r for r in StreamReader(file).records if isinstance(r, Schema | Channel)]
                 channels = [each for each in records if isinstance(each, Channel)]
                 schemas = {each.id: each for each in records if isinstance(each, Schema)}
-    except (OSError, McapError, struct.error, *_DAMAGED) as error:
+    except (OSError, RecordingError, McapError, struct.error, *_DAMAGED) as error:
         reason = (str(error) or type(error).__name__) if _ends_whole(path) else _NO_END
         raise DeviceError(f"{path}: cannot be read ({reason})") from None
     for channel in channels:

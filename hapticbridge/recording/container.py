@@ -19,7 +19,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from hapticbridge.errors import RecordingError
+from hapticbridge.errors import RecordingError, choices
 from hapticbridge.units import format_count
 
 # Random access to a file's bytes
@@ -311,6 +311,31 @@ class Container:
             self.problems = found
         return None
 
+    def foreign_compression(self) -> str:
+        """Returns a sentence if all chunks have a compression that is none of MCAP; else empty.
+
+        A single chunk of that kind is damage, which ``records`` reports.
+        """
+        names, found, self.problems = set[str](), self.problems, []
+        try:
+            for opcode, body, stop in self._walk(len(MAGIC), self._end, self._chunks):
+                if opcode == Opcode.CHUNK:
+                    fields = Fields(self._data, body, stop)
+                    fields.raw(_CHUNK.size)
+                    names.add(fields.text())
+                    if names & COMPRESSIONS:
+                        return ""
+        except DamageError:
+            return ""
+        finally:
+            self.problems = found
+        if not names:
+            return ""
+        return (
+            f"its chunks are compressed by {choices(names)}, and MCAP has 'lz4', 'zstd' and none; "
+            "let the program that wrote it take one of these"
+        )
+
     def records(self) -> Iterator[_Record]:
         """Yields blocks of messages and, as (opcode, fields), metadata and attachments, in order.
 
@@ -424,10 +449,14 @@ class Container:
             position = following
 
 
+COMPRESSIONS = {"", "lz4", "zstd"}
+"""Compressions of chunks that MCAP defines; an empty name for none."""
+
+
 def _decompressed(compression: str, packed: bytes, size: int) -> bytes:
     if not compression:
         return packed
-    if compression not in ("lz4", "zstd"):
+    if compression not in COMPRESSIONS:
         raise DamageError(f"its compression '{compression}' is not one of 'lz4', 'zstd' and none")
     try:
         if compression == "lz4":

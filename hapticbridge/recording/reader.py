@@ -598,6 +598,8 @@ def _read_parts(
             what = "it is empty" if not len(data) else "it does not start with the MCAP magic"
             raise RecordingError(f"{path} is not an MCAP file: {what}")
         container = Container(data)
+        if reason := container.foreign_compression():
+            raise RecordingError(f"{path} cannot be read: {reason}")
         contents = Contents(container.problems, take, keeps_events=keeps_events)
         contents.add_block(container.summary())
         if keeps_events:

@@ -28,9 +28,9 @@ from hapticbridge.recording.reader import BLOCK
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.scene.checks import first_pump, unmetered_work
 from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
-from hapticbridge.scene.physics import STEADY_WAY, Lengths
+from hapticbridge.scene.physics import STEADY_WAY, TendonWatch, WayJump
 from hapticbridge.theory.bounds import NEEDED_SHARE
-from hapticbridge.units import format_count, format_energy, format_number, format_si
+from hapticbridge.units import format_count, format_energy, format_number
 
 Kind = Literal[
     "method",
@@ -343,35 +343,32 @@ def _jump_cause(
 ) -> Cause | None:
     """Returns a tendon that jumps as the cause, if its jumps brought most of the energy.
 
-    A jump stretches the tendon's spring, or breaks its limit or constraint, without any work.
+    A jump of length stretches the tendon's spring, or breaks its limit or constraint, without any
+    work. Where its moment arms jump, a step takes the force of one side for that of the other.
     """
     model, total = evidence.model, float(gained.sum())
     if model is None or not model.ntendon or total <= 0.0:
         return None
     if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
         return None
-    at_jump, largest = np.zeros((model.ntendon, gained.size)), np.zeros(model.ntendon)
-    last: Lengths | None = None
+    at_jump, largest = np.zeros((model.ntendon, gained.size)), dict[int, WayJump]()
+    watch = TendonWatch(model)
     try:
         for tick, data in enumerate(_states_in(evidence, window)):
-            now = Lengths.of(data)
-            if last is not None:
-                for tendon, size in now.jumps_since(last, evidence.parameters.period).items():
-                    at_jump[tendon, max(tick - 1, 0) : tick + 2] = 1.0  # lengths lag by a step
-                    largest[tendon] = max(largest[tendon], size)
-            last = now
+            for tendon, jump in watch.jumps(data).items():
+                at_jump[tendon, max(tick - 1, 0) : tick + 2] = 1.0  # lengths of a step lag by one
+                largest[tendon] = max(largest.get(tendon, jump), jump)
     except RecordingError:
         return None
     shares = at_jump @ gained / total
     tendon = int(np.argmax(shares))
     if shares[tendon] < MOST:
         return None
-    name = model.tendon(tendon).name or str(tendon)
+    name, jump = model.tendon(tendon).name or str(tendon), largest[tendon]
     return Cause(
         "jumping tendon",
-        f"{shares[tendon]:.0%} of the energy created until then came as the length of tendon "
-        f"'{name}' jumped, by up to {format_si(largest[tendon], 'm')} in one tick: its way round a "
-        "geom changed",
+        f"{shares[tendon]:.0%} of the energy created until then came as the {jump.quantity} of "
+        f"tendon '{name}' jumped, by up to {jump.size} in one tick: its way round a geom changed",
         f"write {STEADY_WAY}",
     )
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.kernel.codes import held_body
 from hapticbridge.scene.contacts import impedance_at
+from hapticbridge.units import format_si
 
 # Poses and rotations as NumPy arrays, by MuJoCo's functions
 
@@ -213,9 +214,23 @@ def depth_under(
 # Tendons that jump
 
 JUMP = 1e-4
-"""Change in m of a tendon's length in a tick, beyond that of its speed, from which on it counts as
-a jump. A tendon that leaves a geom which it wraps jumps by mm; a smaller value would tell rounding
-of a blow's tick."""
+"""Smallest change in m of a tendon's length at one place that counts as a jump. A tendon that
+leaves a geom which it wraps jumps by mm; a smaller value would tell jumps that no force shows."""
+
+KINK = 0.1
+"""Smallest change of a tendon's moment arms at one place that counts as a jump, relative to them. A
+way that changes its side of a geom turns them round; a smaller value would tell kinks that move
+little energy."""
+
+_HALVINGS = 20
+"""Number of bisections of a tick's motion in search of a jump: to a millionth of its way."""
+
+_PLACE = (
+    mujoco.mjtState.mjSTATE_QPOS
+    | mujoco.mjtState.mjSTATE_MOCAP_POS
+    | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+)
+"""State from which the ways of tendons follow."""
 
 STEADY_WAY = (
     'a sidesite="…" at the geom that it wraps, or a geom that it never leaves or never meets'
@@ -223,23 +238,102 @@ STEADY_WAY = (
 """Change that keeps a tendon from jumping."""
 
 
-class Lengths(NamedTuple):
-    """Lengths of all tendons in m or rad (n,), and their rates."""
+class WayJump(NamedTuple):
+    """Jump of a tendon as its way round a geom changes.
 
-    lengths: NDArray[np.float64]
-    rates: NDArray[np.float64]
+    Attributes:
+        length: Change of its length in m at one place; 0 for a kink, at which the length is steady.
+        arms: Change of its moment arms there, relative to those about it.
+    """
 
-    @classmethod
-    def of(cls, data: mujoco.MjData) -> Lengths:
-        """Returns copies of the present lengths and rates."""
-        return cls(data.ten_length.copy(), data.ten_velocity.copy())
+    length: float
+    arms: float
 
-    def jumps_since(self, before: Lengths, period: float) -> dict[int, float]:
-        """Returns by how much each tendon jumped in a period; only those that did.
+    @property
+    def quantity(self) -> str:
+        """Name of what jumped."""
+        return "length" if self.length else "moment arms"
 
-        A length L of a smooth path changes by |ΔL| <= T max |L̇| in a period T. The factor of two
-        leaves room for rates within the steps of a tick.
-        """
-        rate = np.maximum(np.abs(before.rates), np.abs(self.rates))
-        beyond = np.abs(self.lengths - before.lengths) - 2.0 * period * rate
-        return {tendon: float(beyond[tendon]) for tendon in np.flatnonzero(beyond > JUMP).tolist()}
+    @property
+    def size(self) -> str:
+        """Size of the jump, with its unit."""
+        return format_si(self.length, "m") if self.length else f"{self.arms:.0%}"
+
+
+class _Ways(NamedTuple):
+    """Ways of all tendons at a place: lengths (n,) in m and moment arms (n, nv)."""
+
+    lengths: Array
+    arms: Array
+
+    def changes(self, after: _Ways) -> tuple[Array, Array]:
+        """Returns the changes of lengths, and of moment arms by their norm."""
+        arms = np.linalg.norm(after.arms - self.arms, axis=1)
+        return np.abs(after.lengths - self.lengths), arms
+
+
+class TendonWatch:
+    """Search for jumps of tendons in a run.
+
+    The motion between two calls is bisected towards the larger change of moment arms: a smooth way
+    changes less and less, one that jumps does not. A way that may take either side of a geom, for
+    want of a ``sidesite``, has a kink where both are equally long: the length is steady there, and
+    the moment arms jump.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        wraps = np.isin(
+            model.wrap_type, [mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER]
+        )
+        tendons = np.repeat(np.arange(model.ntendon), model.tendon_num)
+        self._wrapping = np.unique(tendons[wraps])
+        self._two_sided = np.unique(tendons[wraps & (model.wrap_prm < 0)])
+        self._model = model
+        self._scratch: mujoco.MjData = mujoco.MjData(model) if self._wrapping.size else None
+        self._last: Array | None = None
+
+    def jumps(self, data: mujoco.MjData) -> dict[int, WayJump]:
+        """Returns the tendons that jumped since the last call; none at the first."""
+        if not self._wrapping.size:
+            return {}
+        end = np.zeros(mujoco.mj_stateSize(self._model, _PLACE))
+        mujoco.mj_getState(self._model, data, end, _PLACE)
+        start, self._last = self._last, end
+        if start is None:
+            return {}
+        ends = self._ways_at(start), self._ways_at(end)
+        sizes = np.max([np.linalg.norm(each.arms, axis=1) for each in ends], axis=0) + 1e-12
+        lengths, arms = ends[0].changes(ends[1])
+        found = {}
+        for tendon in self._wrapping[((lengths > JUMP) | (arms > KINK * sizes))[self._wrapping]]:
+            length, arm = self._smallest_change(tendon, start, end)
+            relative = float(arm / sizes[tendon])
+            if length > JUMP:
+                found[int(tendon)] = WayJump(length, relative)
+            elif relative > KINK and tendon in self._two_sided:
+                found[int(tendon)] = WayJump(0.0, relative)
+        return found
+
+    def _smallest_change(self, tendon: int, low: Array, high: Array) -> tuple[float, float]:
+        """Returns what is left of a tendon's change of length and moment arms in the bisection."""
+        before, after = self._ways_at(low), self._ways_at(high)
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            ways = self._ways_at(middle)
+            if before.changes(ways)[1][tendon] > ways.changes(after)[1][tendon]:
+                high, after = middle, ways
+            else:
+                low, before = middle, ways
+        length, arms = before.changes(after)
+        return float(length[tendon]), float(arms[tendon])
+
+    def _ways_at(self, place: Array) -> _Ways:
+        model, data = self._model, self._scratch
+        mujoco.mj_setState(model, data, place, _PLACE)
+        for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_tendon):
+            compute(model, data)
+        arms = np.zeros((model.ntendon, model.nv))
+        mujoco.mju_sparse2dense(
+            arms, data.ten_J, model.ten_J_rownnz, model.ten_J_rowadr, model.ten_J_colind
+        )
+        return _Ways(data.ten_length.copy(), arms)
