@@ -215,20 +215,41 @@ def test_what_cannot_be_learned_from_is_refused_and_leaves_nothing(
     cases: list[tuple[list[Path], str, Shot, str]] = [
         ([], "lerobot", Shot(), "a recording at least"),
         ([cut], "lerobot", Shot(), "its end is missing"),
-        ([runs[0], other], "lerobot", Shot(), f"than '{runs[0].name}'; the episodes of a data"),
+        ([runs[0], other], "lerobot", Shot(), f"other joints, .* than '{runs[0].name}'; the epis"),
         ([other], "robomimic", Shot(fps=1), "shorter than two frames"),
+        ([other, runs[0]], "lerobot", Shot(), "the scenes 'point_mass', 'ratchet', and one's name"),
         (runs, "lerobot", Shot(camera="nowhere"), "no camera 'nowhere'"),
         (runs, "csv", Shot(), "the formats are 'lerobot', 'robomimic'"),
     ]
     for paths, form, shot, words in cases:
         with pytest.raises(HapticBridgeError, match=words):
-            write_dataset(paths, form, target, shot)
+            task = "push" if "other joints" in words else None
+            write_dataset(paths, form, target, shot, task=task)
     with pytest.raises(RecordingError, match="does not exist"):
         write_dataset(runs, "lerobot", tmp_path / "no" / "set")
     target.mkdir()
     with pytest.raises(RecordingError, match="exists"):
         write_dataset(runs, "lerobot", target)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap", "other.mcap", "set"]
+
+
+@pytest.mark.parametrize(
+    ("options", "fps", "most"),
+    [({"rate": 25.0}, 26, 25), ({"scene_rate": 20.0}, 30, 20), ({"rate": 60.0}, 61, 60)],
+)
+def test_frames_that_would_repeat_are_refused_with_the_most(
+    tmp_path: Path, options: dict[str, Any], fps: int, most: int
+) -> None:
+    run = tmp_path / "run.mcap"
+    clock = hb.SimulatedClock()
+    with hb.Bridge("point_mass", clock=clock, recording=run, i_know=True, **options) as bridge:
+        bridge.run(duration=1.0)
+    with pytest.raises(RecordingError, match=rf"some of {fps} frames .* --fps {most} or fewer"):
+        write_dataset([run], "lerobot", tmp_path / "no", Shot(fps=fps))
+    done = write_dataset([run], "lerobot", tmp_path / "set", Shot(fps=most), task="")
+    state = np.array(lerobot(done.folder, 0)["observation.state"])
+    assert (np.abs(np.diff(state[2:], axis=0)).max(axis=1) > 0.0).all()  # it starts at rest
+    assert pq.read_table(done.folder / "meta" / "tasks.parquet").to_pandas().index[0] == ""
 
 
 def test_a_programs_run_has_its_tool_and_says_where_it_was_placed_anew(

@@ -84,8 +84,13 @@ def test_a_library_is_named_or_found(
         open_device(maker.name)
     broken = tmp_path / "broken.so"
     broken.write_bytes(b"no library")
-    with pytest.raises(DeviceError, match="cannot be loaded"):
-        open_device(f"{maker.name}:library={broken}")
+    monkeypatch.chdir(tmp_path)
+    # the loader looks for a name without a folder elsewhere, and finds no such file there
+    for name in (str(broken), "./broken.so", "broken.so"):
+        with pytest.raises(DeviceError, match=f"'{broken}' cannot be loaded"):
+            open_device(f"{maker.name}:library={name}")
+    with pytest.raises(DeviceError, match=r"'none\.so' cannot be loaded"):
+        open_device(f"{maker.name}:library=none.so")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not name what is missing")

@@ -12,6 +12,7 @@ import pytest
 import zstandard
 from audit_cases import recorded
 from cli_cases import Called
+from mcap.opcode import Opcode
 from mcap.records import Chunk
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
@@ -113,6 +114,10 @@ def test_some_messages_without_stamps_are_told_and_a_simulated_clock_from_0_is_n
         read_bag(file)
     (file,) = bag(tmp_path / "simulated", {"/hand": ramp(start=0)}).glob("*.mcap")
     np.testing.assert_allclose(read_bag(file).table[:, 0], 0.01 * np.arange(5), atol=1e-12)
+    slow = [(at, pose_message(i // 2 * 10**8, 1e-3 * i)) for i, (at, _) in enumerate(ramp())]
+    (file,) = bag(tmp_path / "slow", {"/hand": slow}).glob("*.mcap")
+    with pytest.raises(DeviceError, match=r"message 1 of /hand: time 0 s after 0 s; times must"):
+        read_bag(file)
 
 
 @pytest.mark.parametrize("jump", [3 * 10**7, -3600 * 10**9])
@@ -294,6 +299,20 @@ def test_a_bag_with_a_changed_byte_is_refused_or_gives_the_same_motion(
         except DeviceError:
             refused += 1
     assert refused > 20
+
+
+def test_a_bag_whose_index_lost_a_chunk_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "hand.mcap"
+    with path.open("wb") as file:
+        writer: Any = McapWriter(file, chunk_size=150)
+        write_ramp(writer)
+    whole, count = bytearray(path.read_bytes()), len(read_bag(path).table)
+    head = struct.pack("<BQ", Opcode.CHUNK_INDEX, 78)
+    assert 1 < whole.count(head) < count
+    whole[whole.rindex(head)] ^= 0x80  # a record of an unknown kind, which readers pass over
+    path.write_bytes(whole)
+    with pytest.raises(DeviceError, match="the index at the end of the file is damaged"):
+        read_bag(path)
 
 
 def test_times_that_do_not_increase_are_told_apart(tmp_path: Path) -> None:

@@ -156,15 +156,15 @@ class Export:
     """Add the readings of the scene's own sensors to a table: the run is simulated again. A data
     set always holds them."""
     fps: int | None = None
-    """Frames per second of a data set, by default 30."""
+    """Frames per second of a data set, by default 30; at most the states of the run per second."""
     camera: str | None = None
     """Camera of the scene whose pictures a data set holds, or 'free'; by default none. A '/' of its
     name becomes '_' there."""
     size: tuple[int, int] | None = option(None, metavar="W H")
     """Width and height of the pictures in pixels, both even; by default 320 240."""
     task: str | None = None
-    """Text of a data set on its task, which policies may be given; by default the scene's name,
-    which says nothing for a program's own."""
+    """Text of a data set on its task, which policies may be given; by default the name of the one
+    scene, which says nothing for a program's own."""
     as_json: bool = option(False, flag="json")
     """Print what was written as JSON."""
 

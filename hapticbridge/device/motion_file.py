@@ -280,7 +280,12 @@ def read_bag(path: Path, topic: str = "") -> Motion:
     from mcap.exceptions import McapError  # noqa: PLC0415
     from mcap.reader import NonSeekingReader, make_reader  # noqa: PLC0415
 
+    from hapticbridge.recording.container import Container, FileBytes  # noqa: PLC0415
+
     kinds = dict(_topics(path))
+    with FileBytes(path) as data:
+        if damage := Container(data).problems:
+            raise DeviceError(f"{path}: {damage[0]}")
     poses = [name for name, kind in kinds.items() if kind == POSE]
     if topic and topic not in poses:
         is_there = f"its type is {kinds[topic]}" if topic in kinds else "there is none"
@@ -319,7 +324,9 @@ def read_bag(path: Path, topic: str = "") -> Motion:
     if len(times) < 2:
         raise DeviceError(f"{path}: {topic} has {len(times)} of at least two messages")
     unset = np.flatnonzero(times == 0)
-    if unset.size and (unset.size > 1 or unset[0] > 0 or times[1] > MAX_SILENCE):
+    # a simulated clock begins at 0, and may stay there for some messages
+    is_before = unset.size < len(times) and unset.size == np.argmax(times != 0)
+    if unset.size and not (is_before and times[unset.size] <= MAX_SILENCE):
         raise DeviceError(
             f"{path}: the stamp is 0 in {unset.size} of the {times.size} messages of {topic}, "
             f"first in message {unset[0]}, as before a clock is set; write the bag without them"

@@ -409,6 +409,13 @@ def _checked_fit(run: AxisRun, info: DeviceInfo) -> AxisFit:
             f"{where}: {run.stale:.0%} of the ticks brought no new sample; choose a rate near the "
             "device's own"
         )
+    largest = float(np.abs(run.force).max())
+    if np.nanmin(run.position) == np.nanmax(run.position):
+        raise IdentificationError(
+            f"{where}: its position did not change under up to {largest:.2g} {unit}; move the "
+            "handle by hand: if it does not change then, check its encoders and calibration, and "
+            "else the power of its motors, or raise --force-share against friction"
+        )
     step = step_of(run.position) or info.resolution or 0.0
     try:
         fit = fit_axis(run.position, run.force, run.period, 0.0 if turns else step)
@@ -431,7 +438,6 @@ def _checked_fit(run: AxisRun, info: DeviceInfo) -> AxisFit:
             "--force-share (its motor may be saturated)"
         )
     if fit.lost_gain.least > LOST_GAIN:
-        largest = float(np.abs(run.force).max())
         raise IdentificationError(
             f"{where}: {fit.lost_gain.value:.0%} of the force above {0.5 * largest:.2g} {unit} did "
             f"not act: the motor saturates; lower --force-share"

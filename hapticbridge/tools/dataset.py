@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -45,8 +46,9 @@ from hapticbridge.kernel.record import force_on_hand
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.ros_messages import axes_of
 from hapticbridge.replay.film import Shot, states
-from hapticbridge.run.description import meta_float
+from hapticbridge.run.description import meta_float, parameters_of
 from hapticbridge.tools.export import time_of
+from hapticbridge.units import format_number
 
 POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
@@ -94,13 +96,21 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
         progress: Called with the finished and all frames, and the recording's name.
 
     Raises:
-        RecordingError: It cannot be simulated again, or has fewer than two frames.
+        RecordingError: It cannot be simulated again, has fewer than two frames, or fewer states
+            than frames.
         HapticBridgeError: Nothing can be drawn here, or the scene has no such camera.
     """
     name = recording.path.name
     tell = None if progress is None else lambda done, total: progress(done, total, name)
+    run = parameters_of(recording.meta)
+    is_posted = run.credit > 0.0  # the scene is the shown tool alone
+    rate = round(1.0 / (run.timestep * run.substeps), 3)  # the period is in whole ns
+    if shot.fps > rate:
+        raise RecordingError(
+            f"'{recording.path}' has {format_number(rate)} states of its scene per second, so that "
+            f"some of {shot.fps} frames would repeat; choose --fps {math.floor(rate)} or fewer"
+        )
     found = states(recording.path, shot, tell)
-    is_posted = meta_float(recording.meta, "credit") > 0.0  # the scene is the shown tool alone
     if is_posted:  # the loop ran before its program showed a tool
         begin = int(np.searchsorted(found["rows"]["tick"], _placed_at(recording), side="right"))
         for key in ("rows", "qpos", "qvel", "ctrl", "sensors", "pictures"):
@@ -477,30 +487,37 @@ def write_dataset(
         form: One of ``DATASETS``.
         folder: Folder to write; it must not exist.
         shot: Frames per second, and the camera and size of pictures; 30 and none by default.
-        task: What was done, in words; None takes the scene's name.
+        task: What was done, in words; None takes the scene's name, if there is one scene.
         progress: Called with the finished and all frames, and the recording's name.
 
     Raises:
         RecordingError: The task is no Unicode text, there is no recording, one is damaged, cut, of
-            another scene than the first or cannot be simulated again, the format is unknown, or
-            the folder exists or cannot be written.
+            another scene than the first or cannot be simulated again, or has fewer states of its
+            scene than frames; scenes of several names have no task; the format is unknown, or the
+            folder exists or cannot be written.
         HapticBridgeError: Nothing can be drawn here, or the scene has no such camera.
     """
     if form not in DATASETS:
         raise RecordingError(f"format {form!r:.60} is unknown; the formats are {choices(DATASETS)}")
     if not paths:
         raise RecordingError("a data set needs a recording at least")
-    if task and not is_unicode(task):
+    if task is not None and not is_unicode(task):
         raise RecordingError(f"the task {task!r:.60} is not in UTF-8")
     shot, folder = shot or Shot(), Path(folder)
     if folder.exists():
         raise RecordingError(f"'{folder}' exists; choose another folder")
     recordings = [_sound(open_recording(path)) for path in paths]
+    scenes = dict.fromkeys(each.meta.get("scene", "") for each in recordings)
+    if task is None and len(scenes) > 1:
+        raise RecordingError(
+            f"the recordings are of the scenes {choices(scenes)}, and one's name is no task for "
+            "all; say with --task what was done"
+        )
     draft, counts, coupled = draft_of(folder), [], dict[str, None]()
     try:
         shutil.rmtree(draft, ignore_errors=True)
         draft.mkdir()
-        writer = DATASETS[form](draft, shot, task or recordings[0].meta.get("scene", ""))
+        writer = DATASETS[form](draft, shot, next(iter(scenes)) if task is None else task)
         with closing(writer):
             for episode in _episodes(recordings, shot, progress):
                 writer.add(episode)
@@ -550,7 +567,7 @@ def _episodes(
         first = first or episode
         if episode.names != first.names:
             raise RecordingError(
-                f"'{recording.path}' has other joints or actuators than '{first.name}'; the "
-                "episodes of a data set are of one scene"
+                f"'{recording.path}' has other joints, actuators or sensors than '{first.name}'; "
+                "the episodes of a data set are of one scene"
             )
         yield episode

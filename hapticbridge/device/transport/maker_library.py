@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from hapticbridge.errors import DeviceError
@@ -88,9 +89,10 @@ class LibraryFiles:
         Raises:
             DeviceError: The library was not found.
         """
-        named = library or os.environ.get(self.variable)
+        named = str(library or os.environ.get(self.variable, ""))
         if named:
-            return str(named)
+            # the loader looks for a name without a folder in its own places alone
+            return str(Path(named).absolute()) if os.access(named, os.F_OK) else named
         for stem in self.stems:
             if (found := ctypes.util.find_library(stem)) is not None:
                 return found
