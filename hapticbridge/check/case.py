@@ -274,17 +274,24 @@ def refused_body(error: SceneError) -> str | int | None:
 
 
 def _compile(source: SceneSource, grip: str) -> tuple[Scene, dict[int, str]]:
-    """Compiles with a stand-in for each inertia that MuJoCo refuses, so other checks can run."""
+    """Compiles with a stand-in for each inertia that MuJoCo refuses, so other checks can run.
+
+    Bodies are then not fused, as a refused one may have no joint. Where that or another fault ends
+    it, the first refusal is raised.
+    """
     refused: dict[str | int, str] = {}
+    first: SceneError | None = None
     while True:
         try:
             scene = compile_scene(source, grip, warns=False, checks_start=False)
             return scene, {int(scene.model.body(key).id): text for key, text in refused.items()}
         except SceneError as error:
+            first = first or error
             if (key := refused_body(error)) is None or key in refused:
-                raise
+                raise first from None
             refused[key] = str(error)
         spec = source.spec.copy()
+        spec.compiler.fusestatic = False
         body = spec.body(key) if isinstance(key, str) else spec.bodies[key]
         body.explicitinertial, body.mass = True, STAND_IN_MASS
         body.inertia, body.fullinertia = np.full(3, STAND_IN_INERTIA), np.full(6, np.nan)
