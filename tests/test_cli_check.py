@@ -135,6 +135,33 @@ def test_check_names_a_body_whose_inertia_mujoco_refuses(
     assert "body 'rod' moves, and MuJoCo refuses its inertia" in out
 
 
+@pytest.mark.parametrize("name", ["tip", ""])
+@pytest.mark.parametrize("joint", ["", "<joint/>"])
+def test_check_names_a_refused_body_that_is_fused_with_its_parent(
+    name: str, joint: str, tmp_path: Path, call: Called
+) -> None:
+    """A body that has no joint is no body of the compiled scene, whatever its number."""
+    rod = "<inertial pos='0 0 0' mass='.1' diaginertia='1e-5 1e-5 1'/>"
+    tip = f"<body{f' name={name!r}' if name else ''}>{joint}{rod}</body>"
+    tool = f"<body name='grip'><freejoint/><geom size='.01' mass='.1'/>{tip}</body>"
+    fuse = "<compiler fusestatic='true'/>"
+    code, out, err = call("check", scene_file(tmp_path, mjcf(fuse, body=tool)))
+    assert code == 1, err
+    assert f"body {f'{name!r}' if name else 2} moves, and MuJoCo refuses its inertia" in out
+
+
+def test_check_says_what_a_run_says_where_no_stand_in_helps(tmp_path: Path, call: Called) -> None:
+    """Bodies with a stand-in are not fused, and below one of them MuJoCo takes no free joint."""
+    rod = "<inertial pos='0 0 0' mass='.1' diaginertia='1e-5 1e-5 1'/>"
+    tool = "<body name='grip'><freejoint/><geom size='.01' mass='.1'/></body>"
+    stand = f"<body name='stand'>{rod}{tool}<body>{rod}</body></body>"
+    scene = scene_file(tmp_path, mjcf("<compiler fusestatic='true'/>", body=stand))
+    found = [call(*words, scene) for words in (("check",), ("run", "--fast"))]
+    assert found[0] == found[1]
+    assert found[0][0] == 2
+    assert "A + B >= C" in found[0][2]
+
+
 LINK = """<robot name="r">{}<link name="base"/><link name="tool"><inertial><mass value="0.3"/>
 <inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial></link>
 <joint name="j" type="prismatic"><parent link="base"/><child link="tool"/>

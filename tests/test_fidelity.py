@@ -92,6 +92,34 @@ def test_contacts_are_named_where_they_are_the_cause_and_undone_where_that_mends
     assert "rigid contacts in place of the file's own" in str(found)
 
 
+SERVO = """<mujoco><option timestep="0.001"/><worldbody>
+<body><joint name="a" axis="0 0 1"/><geom type="box" size=".05 .05 .01" mass=".2"/>
+<site name="grip"/></body>
+<body name="wheel" pos="1 0 0"><joint name="b" axis="0 0 1"/>
+<geom type="cylinder" size=".05 .01" mass=".2"/></body></worldbody>
+<equality><joint joint1="b" joint2="a" polycoef="0 -1 0 0 0"/></equality>
+<actuator><velocity joint="b" kv="0.5"/></actuator>
+<keyframe><key name="home" ctrl="1"/></keyframe></mujoco>"""
+"""A motor that stretches a soft constraint, by less the more of its damping is in the step."""
+
+
+def test_two_causes_of_which_neither_makes_half_are_both_named(tmp_path: Path) -> None:
+    found = moved(scene(tmp_path, SERVO))
+    assert set(found.causes) == {Cause.OPTIONS, Cause.CONTACT}
+    assert "rigid contacts in place of the file's own, here of joint equality" in str(found)
+    # in MuJoCo the options alone leave more than a quarter of the angle, and less than all of it
+    ends = []
+    for integrator in ("Euler", "discrete"):
+        text = SERVO.replace('timestep="0.001"', f'timestep="0.001" integrator="{integrator}"')
+        model = mujoco.MjModel.from_xml_string(text)
+        model.dof_armature[0] = model.dof_M0[0] = 1e6  # held, as by a hand at rest
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        mujoco.mj_step(model, data, 1000)
+        ends.append(float(data.qpos[1]))
+    assert 0.25 * ends[0] < ends[1] < 0.75 * ends[0]
+
+
 SOFT_BLOCK = """<mujoco><worldbody><body name="base" pos="0 0 .3"><flexcomp name="soft" dim="3"
 type="grid" count="3 3 3" spacing=".03 .03 .03" mass=".3" radius=".002"><edge equality="true"/>
 <contact selfcollide="none"/><pin id="0 1 2 3 4 5 6 7 8"/></flexcomp></body>

@@ -38,6 +38,8 @@ def test_missing_file_name_and_folder_are_told_apart(tmp_path: Path) -> None:
     assert refusal(tmp_path).startswith(f"scene '{tmp_path}' is a folder")
     assert "empty" in refusal("")
     assert "too long" in refusal("x" * 5000)
+    assert "MjSpec.from_string" in refusal(mjcf())
+    assert "MjSpec.from_string" in refusal("\n" + mjcf("<!-- -->" * 1000))
 
 
 def test_a_file_goes_before_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -101,6 +101,20 @@ CASES = {
 }
 
 
+FOLDED = scene_text(  # a step turns the pair, so that the weld's orientation is to be closed, too
+    '<body name="block" pos=".6 0 -.07"><freejoint/><geom type="box" size=".03 .03 .03" mass=".2"/>'
+    "</body>",
+    '<equality><weld body1="tool" body2="block" relpose="0 0 -.05 1 0 0 0" torquescale=".01"/>'
+    "</equality>",
+)
+
+
+def test_a_weld_is_closed_whatever_its_torquescale(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, FOLDED))
+    assert error(scene) < 1e-8
+    assert "closed" in started_said(scene)[0]
+
+
 @pytest.mark.parametrize("text", CASES)
 def test_violated_constraint_is_closed_before_the_run_and_said(tmp_path: Path, text: str) -> None:
     scene = load_scene(scene_file(tmp_path, text))

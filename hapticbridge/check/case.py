@@ -276,32 +276,27 @@ def refused_body(error: SceneError) -> str | int | None:
 def _compile(source: SceneSource, grip: str) -> tuple[Scene, dict[int, str]]:
     """Compiles with a stand-in for each inertia that MuJoCo refuses, so other checks can run.
 
-    Raises:
-        SceneError: The scene does not compile. If a stand-in does not help, or MuJoCo fuses it with
-            another body (``fusestatic``), the message is MuJoCo's on the inertia.
+    Bodies are then not fused, as a refused one may have no joint. Where that or another fault ends
+    it, the first refusal is raised.
     """
     refused: dict[str | int, str] = {}
+    first: SceneError | None = None
     while True:
         try:
             scene = compile_scene(source, grip, warns=False, checks_start=False)
-            break
+            return scene, {int(scene.model.body(key).id): text for key, text in refused.items()}
         except SceneError as error:
-            key = refused_body(error)
-            is_lost = isinstance(key, int) and source.spec.compiler.fusestatic
-            if key is None or key in refused or is_lost:
-                raise SceneError(next(iter(refused.values()), str(error))) from error
+            first = first or error
+            if (key := refused_body(error)) is None or key in refused:
+                raise first from None
             refused[key] = str(error)
         spec = source.spec.copy()
+        spec.compiler.fusestatic = False
         body = spec.body(key) if isinstance(key, str) else spec.bodies[key]
         body.explicitinertial, body.mass = True, STAND_IN_MASS
         body.inertia, body.fullinertia = np.full(3, STAND_IN_INERTIA), np.full(6, np.nan)
         body.ipos = np.nan_to_num(body.ipos)  # MuJoCo would take the body's own position for it
         source = replace(source, spec=spec)
-    names = {scene.model.body(i).name: i for i in range(scene.model.nbody)}
-    bodies = [names.get(key, 0) if isinstance(key, str) else key for key in refused]
-    if 0 in bodies:
-        raise SceneError(next(iter(refused.values())))
-    return scene, dict(zip(bodies, refused.values(), strict=True))
 
 
 def _default_motion() -> Motion:

@@ -65,6 +65,10 @@ NOTABLE_ENERGY = 1e-4
 """Energy in J that a scene may create with a remedy: a tenth of what a hand puts in when it
 taps."""
 
+PART = 0.25
+"""Part of a deviation, no unit, from which on a replacement that makes it is a cause among others.
+Smaller parts are found by chance where contacts open and close."""
+
 ROUNDING = 1e-9
 """Relative error of a time step as it is written."""
 
@@ -141,7 +145,8 @@ class Fidelity:
         step: The file's own time step in s.
         seconds: Time in s that was compared.
         created: Energy in J that the scene created meanwhile in the bridge.
-        causes: Replacements without which the first deviation is less than half as large.
+        causes: Replacements without which the first deviation is less than half as large. Where
+            none is alone, those without which it is by ``PART`` smaller are among them.
         constraint: Name of the constraint of the file whose force does most of the work between
             both places of its body; empty if none does.
         remedy: Rate, substeps and contact with which no body deviates, tried; None without one.
@@ -177,7 +182,7 @@ class Fidelity:
             )
         ending = "ies deviate" if len(others) > 1 else "y deviates"
         more = f", and {len(others)} more bod{ending}" if others else ""
-        cause = " and ".join(each.value for each in self.causes)
+        cause = ", and ".join(each.value for each in self.causes)
         if self.constraint and {Cause.CONTACT, Cause.DIAGONAL} & set(self.causes):
             cause += f", here of {self.constraint}"
         return (
@@ -321,20 +326,25 @@ class _FileMotion:
         mujoco.mj_differentiatePos(self.model, way, 1.0, scene.data.qpos, self.last.qpos)
         row = _working(self.last, found.deviations[0].number, way)
         causes: list[Cause] = []
+        part: tuple[Cause, ...] = ()
+        least = (1.0 - PART) * found.size
         remedy, more, force = None, 0.0, _force(scene, setting)
         for undone, other in self._settings(scene, setting):
             trial = self._tried(scene, other)
             if trial.size < 0.5 * found.size and not set(causes) & set(undone):
                 causes += undone
+            if trial.size < least:
+                part, least = undone, trial.size
             is_calm = trial.created <= max(found.created, NOTABLE_ENERGY)
             if remedy is None and is_calm and not trial.deviations:
                 more = max(_force(scene, other) - force, 0.0)
                 remedy = other if more <= MORE else None
+        causes = causes or [self._other_cause(scene, found.deviations[0]), *part]
         if row >= 0 and _is_soft_here(self.last, row):
             causes = [Cause.DIAGONAL if each is Cause.CONTACT else each for each in causes]
         return replace(
             found,
-            causes=tuple(causes) or (self._other_cause(scene, found.deviations[0]),),
+            causes=tuple(causes),
             constraint=constraint_name(self.model, self.last, row) if row >= 0 else "",
             remedy=remedy,
             more=more if remedy else 0.0,

@@ -100,12 +100,19 @@ def scene_path(path_or_name: str | Path) -> Path:
         raise SceneError(
             f"the scene's name is empty; give an MJCF file or one of: {choices(scene_names())}"
         )
+    is_text = str(path_or_name).lstrip().startswith("<")
     path = Path(path_or_name)
     try:
         if path.is_file():
             return path
     except OSError as error:
-        raise SceneError(f"cannot read scene '{path!s:.80}': {error.strerror}") from None
+        if not is_text:  # which is too long for a file's name
+            raise SceneError(f"cannot read scene '{path!s:.80}': {error.strerror}") from None
+    if is_text:
+        raise SceneError(
+            "the scene is a text of MJCF, and not a file; give mujoco.MjSpec.from_string(TEXT), or "
+            "write it to a file"
+        )
     if path.is_dir():
         raise SceneError(f"scene '{path}' is a folder; name the MJCF file in it")
     name = str(path_or_name)
