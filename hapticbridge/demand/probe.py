@@ -29,6 +29,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,7 +39,6 @@ from hapticbridge.demand.loop_setting import delay_ticks, device_period
 from hapticbridge.device.base import AXES, USUAL_FORCE_LIMIT, USUAL_TORQUE_LIMIT, DeviceInfo
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.parameters import ROUNDING
-from hapticbridge.kernel.pose import Quaternion, quaternion_of, rotation_between
 from hapticbridge.kernel.record import TickFlag
 from hapticbridge.units import format_si
 
@@ -389,22 +389,34 @@ def probe_devices(
 def _push(port: Port, sample: NDArray[np.void], pushes: Sequence[Push], clock: Clock) -> None:
     """Sends the forces, and notes the samples."""
     wrench, begin = np.zeros((len(pushes), 6)), clock.now()
-    starts: dict[int, tuple[Array, Quaternion]] = {}
+    starts: dict[int, tuple[Array, Array]] = {}
     time = 0.0
     while time < LEAD + len(SIGNS) * PULSE + MAX_DELAY:
         clock.wait()
         flags = port.read(sample)
         time = 1e-9 * (clock.now() - begin)
         for i, push in enumerate(pushes):
-            place, turn = sample["position"][i], quaternion_of(sample["quaternion"][i])
-            start = starts.setdefault(i, (place.copy(), turn))
+            place, turn = sample["position"][i], sample["quaternion"][i]
+            start = starts.setdefault(i, (place.copy(), turn.copy()))
             is_new = not flags[i] & int(TickFlag.STALE_SAMPLE)
             if is_new:
                 is_linear = push.axis < 3
-                way = place - start[0] if is_linear else rotation_between(start[1], turn)
+                way = place - start[0] if is_linear else _rotation(start[1], turn)
                 push.times.append(time)
                 push.places.append(tuple(way))
             if is_new or not push.times or time > push.times[-1] + 2.0 * SLOWEST:
                 # a force is as old as its sample, and not held back by the device
                 wrench[i, push.axis] = push.next_force(time)
         port.write(wrench)
+
+
+def _rotation(start: Array, end: Array) -> Array:
+    """Returns the rotation vector from one orientation to another, in the world frame.
+
+    The compiled one of ``kernel.pose`` would be loaded at its first call, within a push.
+    """
+    back, turn, vector = np.zeros(4), np.zeros(4), np.zeros(3)
+    mujoco.mju_negQuat(back, start)
+    mujoco.mju_mulQuat(turn, end, back)
+    mujoco.mju_quat2Vel(vector, turn, 1.0)
+    return vector

@@ -14,7 +14,7 @@ from pathlib import Path
 from waiting import PATIENCE, is_alive
 
 BRIDGE = """
-import os, re, signal, sys, time
+import gc, os, re, signal, sys, time
 sys.path.insert(0, sys.argv[1])
 import numpy as np
 from emulated.hid_seam import HidSeam
@@ -56,6 +56,7 @@ def act(tick):
 limits = Limits(force=10.0, torque=0.5, ramp=0.2, energy=np.inf)
 try:
     with Bridge("virtual_wall", device, limits=limits, realtime=False) as bridge:
+        gc.disable()  # as a run in real time: a collection takes 0.1 s on a busy machine
         bridge.run(10.0, act)
 except Exception as error:
     print(error, flush=True)
