@@ -441,6 +441,28 @@ def test_numbers_in_another_notation_are_refused_at_their_line(tmp_path: Path, t
         open_device(f"trajectory:{path}")
 
 
+@pytest.mark.parametrize(
+    "time", ["0:00:00.01", "00:00.01", "2024-05-01T12:00:00Z", "05/01/24 12:00:00 PM"]
+)
+def test_a_time_of_day_is_told_from_seconds(time: str, tmp_path: Path) -> None:
+    path = tmp_path / "motion.csv"
+    path.write_text(f"t,x,y,z\n{time},0,0,0\n1,0,0,0\n")
+    with pytest.raises(DeviceError, match=r"line 2: column 't' holds .* a date; times are in s"):
+        read_motion(path)
+    path.write_text(f"t,x,y,z\n0,{time},0,0\n1,0,0,0\n")
+    with pytest.raises(DeviceError, match=r"column 'x' holds .*, which is not a number"):
+        read_motion(path)
+
+
+def test_a_split_bag_is_told_with_what_joins_it(tmp_path: Path) -> None:
+    folder = bag(tmp_path / "walk", {"/hand": ramp()})
+    (file,) = folder.glob("*.mcap")
+    (folder / "walk_1.mcap").write_bytes(file.read_bytes())
+    for place in (folder, f"{folder}:/hand"):
+        with pytest.raises(DeviceError, match="or let 'ros2 bag convert' write the whole bag into"):
+            open_device(f"trajectory:{place}")
+
+
 def test_a_bag_in_sqlite_and_a_folder_of_several_are_told(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     bag.mkdir()

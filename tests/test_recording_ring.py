@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import subprocess
@@ -311,3 +312,19 @@ def test_a_fence_releases_a_lock_before_it_acquires_one(monkeypatch: pytest.Monk
     monkeypatch.setattr(ring_module, "ORDER", Noting())
     ring_module.fence()
     assert "acquire" in steps[steps.index("release") :]
+
+
+@pytest.mark.skipif(ring_module.memory_folder() != Path("/dev/shm"), reason="needs /dev/shm")
+@pytest.mark.parametrize("is_shared", [True, False])
+def test_memory_that_a_container_lacks_is_told_with_its_option(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_shared: bool
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("hapticbridge.recording.ring.mmap.mmap", full)
+    if not is_shared:
+        monkeypatch.setattr("hapticbridge.recording.ring.memory_folder", lambda: tmp_path)
+    with pytest.raises(RecordingError, match="No space left on device") as told:
+        Ring.shared(1000)
+    assert ("--shm-size" in str(told.value)) is is_shared

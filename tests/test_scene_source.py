@@ -521,6 +521,13 @@ def test_a_part_that_loses_nothing_is_not_told(tmp_path: Path) -> None:
         load_scene(tmp_path / "scene.xml", grip="tool")
 
 
+def test_a_composite_is_told_with_what_makes_it_now(tmp_path: Path) -> None:
+    composite = '<composite type="grid" count="3 3 1" spacing=".1"/>'
+    path = scene_file(tmp_path, mjcf(body=composite))
+    with pytest.raises(SceneError, match=r"'composite', line \d+\): MuJoCo has none any more; <fl"):
+        read_scene(path)
+
+
 # What MuJoCo loses as it copies
 
 DANGLING = {

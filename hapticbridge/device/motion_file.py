@@ -80,9 +80,15 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
             values.extend([number_from(fields[column]) for column in columns])
         except ValueError:
             column = next(i for i in columns if not _is_number(fields[i]))
+            held = fields[column].strip()
+            is_clock = names[column] == TIME_AND_POSITION[0] and re.search(r"\d[:-]\d", held)
+            what = (
+                "a time of day or a date; times are in s from any moment on, such as 0.25"
+                if is_clock
+                else "which is not a number"
+            )
             raise DeviceError(
-                f"{path}, line {number}: column '{names[column]}' holds "
-                f"{fields[column].strip()!r:.40}, which is not a number"
+                f"{path}, line {number}: column '{names[column]}' holds {held!r:.40}, {what}"
             ) from None
         numbers.append(number)
     if len(numbers) < 2:

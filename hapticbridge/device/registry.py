@@ -503,7 +503,10 @@ def _refuse_other_bag(path: Path) -> None:
         return
     bags = [file.name for file in files if file.suffix == ".mcap"]
     if len(bags) > 1:
-        raise DeviceError(f"{path}: a folder of {len(bags)} files; name one of {choices(bags[:8])}")
+        one = f"name one of {choices(bags[:8])}"
+        if (path / "metadata.yaml").is_file():
+            one += ", or let 'ros2 bag convert' write the whole bag into one"
+        raise DeviceError(f"{path}: a folder of {len(bags)} files; {one}")
     if kind := next(filter(None, map(foreign_kind, files)), ""):
         raise DeviceError(f"{path}: {kind}")
 

@@ -31,6 +31,7 @@ if sys.platform != "win32":
     import fcntl
 
 _PREFIX = "hapticbridge-ring-"
+_MEMORY = Path("/dev/shm")
 
 
 def memory_folder() -> Path:
@@ -40,12 +41,11 @@ def memory_folder() -> Path:
     tracks attached processes, removes the memory under its owner, and prints about leaks after a
     kill. A confined process (``confinement``) may not open it.
     """
-    memory = Path("/dev/shm")
     try:
-        os.close(os.open(memory, os.O_RDONLY))
+        os.close(os.open(_MEMORY, os.O_RDONLY))
     except OSError:
         return Path(tempfile.gettempdir())
-    return memory if os.access(memory, os.W_OK) else Path(tempfile.gettempdir())
+    return _MEMORY if os.access(_MEMORY, os.W_OK) else Path(tempfile.gettempdir())
 
 
 def created(content: str, size: int) -> tuple[mmap.mmap, str]:
@@ -61,9 +61,11 @@ def created(content: str, size: int) -> tuple[mmap.mmap, str]:
         _sweep(folder)
         memory, path = _created(folder, size)
     except OSError as error:
+        reason = limit_words(error.errno) or error.strerror
+        if error.errno == errno.ENOSPC and folder == _MEMORY:
+            reason = f"{reason}; in a container '--shm-size 1g' of 'docker run' gives it more"
         raise RecordingError(
-            f"no room for {content} ({size} bytes) in {folder}: "
-            f"{limit_words(error.errno) or error.strerror}"
+            f"no room for {content} ({size} bytes) in {folder}: {reason}"
         ) from error
     return memory, str(path)
 

@@ -185,6 +185,11 @@ _WORDING: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
         r"could not find decoder.*",
         "its name must end in .xml and it must hold MJCF (of a compiled .mjb, the file behind it)",
     ),
+    (
+        r"Schema violation: (unrecognized element \(element 'composite'.*?\))",
+        r"\1: MuJoCo has none any more; <flexcomp> and <replicate> do much of it, or an older "
+        "MuJoCo saves the scene with all its bodies (mj_saveLastXML)",
+    ),
     (r"(engine error: Could not allocate memory)", r"\1; reduce the numbers in <size>"),
 )
 """Patterns of MuJoCo's error messages, and their wording after a colon."""
