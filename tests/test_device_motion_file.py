@@ -463,6 +463,20 @@ def test_a_split_bag_is_told_with_what_joins_it(tmp_path: Path) -> None:
             open_device(f"trajectory:{place}")
 
 
+def test_a_damaged_recording_is_no_motion_and_a_cut_one_says_so(tmp_path: Path) -> None:
+    scene, run = load_scene("point_mass"), tmp_path / "run.mcap"
+    recorded(run, "point_mass", duration=0.6)
+    whole = run.read_bytes()
+    run.write_bytes(whole + b"more")
+    for read in (lambda: open_device(f"trajectory:{run}"), lambda: motion_for(scene, run)):
+        with pytest.raises(DeviceError, match="is damaged, so that it is no motion: its end is fo"):
+            read()
+    run.write_bytes(whole[: 3 * len(whole) // 4])
+    for read in (lambda: open_device(f"trajectory:{run}"), lambda: motion_for(scene, run)):
+        with pytest.warns(UserWarning, match="its end is missing.*; the motion ends there"):
+            read()
+
+
 def test_a_bag_in_sqlite_and_a_folder_of_several_are_told(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     bag.mkdir()

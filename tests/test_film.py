@@ -253,6 +253,33 @@ def test_a_changed_record_is_not_drawn(sway: Path, tmp_path: Path) -> None:
         Stage(rewritten(recording, tmp_path / "old.mcap", meta={"versions": versions}))
 
 
+@pytest.mark.parametrize("command", ["render", "view"])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda data: data + b"more", "its end is followed by 4 more bytes"),
+        (lambda data: data[:-30], "the file is cut: its end is missing"),
+    ],
+)
+def test_what_shows_a_damaged_or_cut_run_says_so(
+    sway: Path,
+    tmp_path: Path,
+    call: Called,
+    monkeypatch: pytest.MonkeyPatch,
+    command: str,
+    change: Callable[[bytes], bytes],
+    words: str,
+) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(change(sway.read_bytes()))
+    monkeypatch.setattr("hapticbridge.cli.recordings.draw", lambda *_, **__: "egl")
+    target = ("--save", tmp_path / "run.html") if command == "view" else (tmp_path / "run.mp4",)
+    code, _, err = call(command, path, *target)
+    assert code == 0
+    assert f"run.mcap: {words}" in " ".join(err.split())
+    assert "; this is what it holds" in " ".join(err.split())
+
+
 @pytest.fixture
 def work(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Puts functions of ``film_work`` in the place of some of the drawing process.

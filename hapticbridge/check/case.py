@@ -21,12 +21,11 @@ from hapticbridge.demand.pulse import Tap
 from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice, read_motion
 from hapticbridge.device.base import checked_number
-from hapticbridge.device.motion_file import is_bag, read_bag
+from hapticbridge.device.motion_file import is_bag, read_bag, read_recorded
 from hapticbridge.device.trajectory import DEFAULT_SECONDS, lissajous
-from hapticbridge.errors import DeviceError, SceneError
+from hapticbridge.errors import SceneError
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.kernel.record import SAMPLE_DTYPE
-from hapticbridge.recording import read_recording
 from hapticbridge.run.options import BridgeOptions, RunSetup, Workspace
 from hapticbridge.scene import Scene, SceneSource, compile_scene
 from hapticbridge.scene.fault import CompiledScene
@@ -47,7 +46,7 @@ def motion_for(scene: Scene, path: str | Path | None = None) -> Motion | None:
         The motion; None if no file was named and none lies beside the scene.
 
     Raises:
-        DeviceError: The file is not a motion.
+        DeviceError: The file is not a motion, or a damaged recording.
         RecordingError: The file is not a recording.
     """
     if path is None:
@@ -57,12 +56,7 @@ def motion_for(scene: Scene, path: str | Path | None = None) -> Motion | None:
         return read_motion(path).relative()
     if is_bag(Path(path)):
         return read_bag(Path(path)).relative()
-    recording = read_recording(path)
-    ticks = recording.ticks
-    try:
-        period = float(recording.meta["period_s"])
-    except (KeyError, ValueError):
-        raise DeviceError(f"{path}: the recording's metadata lack its period (period_s)") from None
+    ticks, period = read_recorded(Path(path))
     # the handle's pose already includes scale and axes; the device's does not
     return Motion(
         ticks["tick"] * period, ticks["handle_position"], ticks["handle_quaternion"]

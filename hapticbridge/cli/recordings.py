@@ -13,7 +13,7 @@ from hapticbridge.arguments import option, shared
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.files import atomic_write, check_target, refuse_existing
-from hapticbridge.recording import read_recording
+from hapticbridge.recording import RecordingFile, open_recording, read_recording
 from hapticbridge.replay.film import USUAL_SHOT, Shot, draw
 from hapticbridge.tools.compare import Comparison, Difference, compare
 from hapticbridge.tools.dataset import DATASETS, write_dataset
@@ -56,6 +56,7 @@ class View:
         address = Address(0 if self.save is not None else self.port)
         from hapticbridge.view.replay import Replay, Theatre  # noqa: PLC0415 - of an extra
 
+        _tell_faults(open_recording(self.file, 0))
         with progress("simulating again") as show:
             replay = Replay(self.file, show, in_process=self.in_process)
         theatre = Theatre(replay, address)
@@ -108,6 +109,7 @@ class Render:
         """Draws; returns the exit code."""
         check_target(self.output, RecordingError)
         refuse_existing(self.output, RecordingError, overwrite=self.overwrite)
+        _tell_faults(open_recording(self.file, 0))
         shot = self.shot
         if shot.at is None and self.output.suffix.lower() == ".png":
             from hapticbridge.report import telling_time  # noqa: PLC0415 - imports matplotlib
@@ -238,6 +240,13 @@ class Export:
                     f"{times}: its episode jumps there; an episode needs a recording of its own"
                 )
         return 0
+
+
+def _tell_faults(recording: RecordingFile) -> None:
+    """Prints that a recording that is shown is damaged or cut."""
+    if recording.faults:
+        told = plain(f"{recording.path}: {recording.faults}; this is what it holds")
+        err.print(f"[yellow]warning:[/yellow] {told}")
 
 
 def _tell_coupled(names: tuple[str, ...]) -> None:

@@ -1,9 +1,10 @@
-"""Motions from files: a table in CSV, an exported recording, a bag of ROS 2."""
+"""Motions from files: a table in CSV, a recording, a bag of ROS 2."""
 
 from __future__ import annotations
 
 import codecs
 import csv
+import math
 import os
 import re
 import stat
@@ -245,6 +246,34 @@ def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
             "where a clock is set; write the motion without those on one side"
         )
     return Motion(table[:, 0], table[:, 1:4], table[:, 4:])
+
+
+# Recording
+
+
+def read_recorded(path: Path) -> tuple[NDArray[np.void], float]:
+    """Reads a recording of one hand as a motion: its records, and the period of its loop in s.
+
+    Raises:
+        DeviceError: It is damaged, or lacks its period.
+        RecordingError: It cannot be read, or is of several hands.
+
+    Warns:
+        UserWarning: Its end is missing.
+    """
+    # imported here, because no other device needs it
+    from hapticbridge.recording import read_recording  # noqa: PLC0415
+
+    recording = read_recording(path)
+    if recording.problems:
+        raise DeviceError(f"{path} is damaged, so that it is no motion: {recording.problems[0]}")
+    if not math.isfinite(period := recording.period):
+        raise DeviceError(
+            f"{path}: the recording lacks its period (period_s), so it cannot be replayed"
+        )
+    if recording.cut_sentence:
+        warnings.warn(f"{path}: {recording.cut_sentence}; the motion ends there", stacklevel=2)
+    return recording.ticks, period
 
 
 # Bag of ROS 2

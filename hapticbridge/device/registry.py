@@ -35,7 +35,7 @@ from hapticbridge.device.base import (
     telling,
 )
 from hapticbridge.device.driver import Driver, FoundDevice, Notify, Options, ignore_message
-from hapticbridge.device.motion_file import is_bag, read_bag, read_motion
+from hapticbridge.device.motion_file import is_bag, read_bag, read_motion, read_recorded
 from hapticbridge.device.profile import modelled, profile_named, profile_of
 from hapticbridge.device.simulated.device import (
     GrippingDevice,
@@ -459,18 +459,8 @@ def _open_trajectory(rest: str, options: Mapping[str, object]) -> Device:
         return TrajectoryDevice(read_motion(path), **limits)
     if topic or is_bag(path):
         return TrajectoryDevice(read_bag(path, topic), **limits)
-    # imported here, because the package device must not depend on recordings; only the replay of a
-    # recording needs the reader
-    from hapticbridge.recording import read_recording  # noqa: PLC0415
-
-    recording = read_recording(path)
-    try:
-        period = float(recording.meta["period_s"])
-    except (KeyError, ValueError):
-        raise DeviceError(
-            f"{path}: the recording lacks its period (period_s), so it cannot be replayed"
-        ) from None
-    return ReplayDevice(recording.ticks, period, name=str(path), **limits)
+    ticks, period = read_recorded(path)
+    return ReplayDevice(ticks, period, name=str(path), **limits)
 
 
 _OPENERS: dict[str, Callable[[str, Mapping[str, object]], Device]] = {

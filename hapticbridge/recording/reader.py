@@ -336,6 +336,11 @@ class RecordingFile:
         causes += [words for name, words in CUTTING_EVENTS.items() if name in names]
         return "; ".join(causes)
 
+    @property
+    def faults(self) -> str:
+        """Damage, and that the run's end is missing, in a line; empty for a whole file."""
+        return "; ".join(filter(None, [*self.problems, self.cut_sentence]))
+
     def blocks(self, size: int | None = None) -> Iterator[NDArray[np.void]]:
         """Yields the records in order, in blocks of equal size (the last: shorter).
 

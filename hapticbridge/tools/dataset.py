@@ -552,9 +552,8 @@ def _resets(recording: RecordingFile) -> tuple[float, ...]:
 
 def _sound(recording: RecordingFile) -> RecordingFile:
     """Returns a recording if it is whole and undamaged; what is learned from must be true."""
-    faults = [*recording.problems, recording.cut_sentence]
-    if found := "; ".join(filter(None, faults)):
-        raise RecordingError(f"'{recording.path}' cannot be learned from: {found}")
+    if recording.faults:
+        raise RecordingError(f"'{recording.path}' cannot be learned from: {recording.faults}")
     return recording
 
 
