@@ -680,10 +680,28 @@ def test_mass_is_taken_from_what_is_only_seen_and_not_from_what_collides(tmp_pat
 def test_a_tool_whose_inertia_is_refused_has_no_centre_that_the_grip_is_far_from(
     tmp_path: Path, mass: str, expected: str
 ) -> None:
-    body = f"""<body name="tool" pos="0 0.7 0"><joint type="slide"/>
+    body = f"""<body name="tool" pos="0 0.7 0"><freejoint/>
         <geom size="0.01" mass="{mass}"/><site name="grip" pos="0 0 0.2"/></body>"""
     found = kinds(faults_in(tmp_path, mjcf(GOOD_OPTION, body=body), STILL))
     assert found & {"missing inertia", "far grip"} == {expected}
+
+
+@pytest.mark.parametrize(
+    ("joints", "is_told"),
+    [
+        ("<freejoint/>", True),
+        ("<joint axis='1 0 0'/>", True),
+        ("<joint type='slide'/>", False),
+        ("<joint type='slide' axis='1 0 0'/><joint axis='0 0 1' pos='0 0 0.2'/>", False),
+    ],
+)
+def test_a_far_grip_is_told_only_of_a_tool_that_pushes_turn(
+    joints: str, is_told: bool, tmp_path: Path
+) -> None:
+    body = f"""<body name="tool" pos="0 0.7 0">{joints}
+        <geom size="0.01" mass="0.1"/><site name="grip" pos="0 0 0.2"/></body>"""
+    found = kinds(faults_in(tmp_path, mjcf(GOOD_OPTION, body=body), STILL))
+    assert ("far grip" in found) is is_told
 
 
 @pytest.mark.parametrize(("floor", "is_told"), [("", True), (FLOOR, False)])

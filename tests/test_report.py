@@ -222,6 +222,11 @@ def test_what_stopped_a_run_is_listed_after_any_number_of_inputs(name: str) -> N
     assert len(event_rows([*inputs, *others])) == MAX_EVENTS
 
 
+def test_the_bytes_of_what_a_program_showed_are_not_listed() -> None:
+    (row,) = event_rows([{"event": "shown", "tick": 3, "count": 2, "posts": "AAAA"}])
+    assert row == ("shown", "3", "–", "count 2")
+
+
 def test_a_browser_shows_the_page_without_a_request_or_a_complaint(
     made: Made, tmp_path: Path
 ) -> None:

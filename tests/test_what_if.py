@@ -457,3 +457,20 @@ def test_a_weight_that_is_carried_in_the_changed_run_alone_is_said(
     for change, is_said in (("force_limit=3", True), ("force_limit=9", False)):
         _, out, _ = call("audit", tmp_path / "run.mcap", "--what-if", change)
         assert bool(re.search("weight of the tool +felt +carried +carried", out)) == is_said
+
+
+def test_a_motion_that_answers_no_force_is_not_called_a_device_that_answers_late(
+    tmp_path: Path,
+) -> None:
+    """Softer, the tool lags more behind the recorded tapping, as a force behind a late device."""
+    path, motion = tmp_path / "taps.mcap", tmp_path / "hand.csv"
+    rows = [f"{0.1 * i},0,0,{-0.03 if i % 2 else 0.02}" for i in range(21)]
+    motion.write_text("\n".join(["t,x,y,z", *rows]))
+    recorded(path, "virtual_wall", f"simulated:path={motion}", duration=1.5)
+    found = what_if(path, {"stiffness": 600})
+    alarms = int(TickFlag.SWINGING | TickFlag.RUNS_AWAY)
+    acted = {run.name: bool((run.ticks["flags"] & alarms).any()) for run in found.runs}
+    assert (acted["recorded"], acted["prescribed"]) == (False, True)
+    (note,) = (each for each in found.notes if "does not answer" in each)
+    assert "says nothing of the device" in note
+    assert not any("does not answer" in each for each in what_if(path, {}).notes)

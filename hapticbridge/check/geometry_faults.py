@@ -33,6 +33,9 @@ _AT_ONCE = 1000  # triangles per block; about 100 MB with a hull of 10 000 facet
 
 _MIN_EXTENT = 1e-3  # m; a grip nearer than this counts as on the tool
 
+_NO_TURN = 1e-9
+"""Angular acceleration in rad/s² by a push of 1 N that is rounding. A ton at 1 m makes 1e-3."""
+
 
 def mesh_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields colliding meshes that are not convex; MuJoCo collides their hulls."""
@@ -106,7 +109,7 @@ def grip_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     grip = scene.data.site_xpos[site]
     distance = float(np.linalg.norm(grip - centre))
     extent = max(float(np.linalg.norm(tool_extent(case))), _MIN_EXTENT)
-    if distance <= FARTHEST_GRIP * extent:
+    if distance <= FARTHEST_GRIP * extent or not _is_turned_by_pushes(model, scene.data, site):
         return
     rotation = scene.data.xmat[body].reshape(3, 3)
     offset = np.round(rotation.T @ (centre - scene.data.xpos[body]), 6) + 0.0  # no -0
@@ -120,6 +123,14 @@ def grip_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         "air",
         f'pos="{local}" (the centre of mass)',
     )
+
+
+def _is_turned_by_pushes(model: mujoco.MjModel, data: mujoco.MjData, site: int) -> bool:
+    """Returns True if a force of 1 N at a site gives its body an angular acceleration."""
+    moved, turned, pushed = np.zeros((3, 3, model.nv))
+    mujoco.mj_jacSite(model, data, moved, turned, site)
+    mujoco.mj_solveM(model, data, pushed, moved)
+    return bool(np.abs(pushed @ turned.T).max() > _NO_TURN)
 
 
 def workspace_faults(case: SceneUnderCheck) -> Iterator[Fault]:

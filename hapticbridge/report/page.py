@@ -271,7 +271,7 @@ def event_rows(events: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str,
 
 
 def _event(event: Mapping[str, Any]) -> tuple[str, str, str, str]:
-    rest = {k: v for k, v in event.items() if k not in ("event", "tick", "time_ns")}
+    rest = {k: v for k, v in event.items() if k not in ("event", "tick", "time_ns", "posts")}
     time = event.get("time_ns")
     at = f"{1e-9 * time:.3f} s" if isinstance(time, int) else "–"
     text = _format_mapping({k: v for k, v in rest.items() if v not in ("", None)})

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.codes import HANDLE, added_actuators, hand_count, name_of_hand
+from hapticbridge.units import format_count
 
 Write = tuple[str, int, list[float]]
 """Field of ``mjData``, index of the first number in it, and the numbers."""
@@ -101,10 +102,10 @@ def _numbers(what: str, value: ArrayLike, counts: tuple[int, ...]) -> list[float
         raise SceneError(f"{what} is {value!r:.80}; it must be numbers") from None
     # MuJoCo treats a larger control as a failure and ignores all controls, also the coupling's
     if array.size not in counts or not np.all(np.abs(array) <= mujoco.mjMAXVAL):
-        expected = " or ".join(str(count) for count in counts)
+        *some, last = counts
+        expected = "".join(f"{count} or " for count in some) + format_count(last, "finite number")
         raise SceneError(
-            f"{what} is {array.tolist()}; it must be {expected} finite numbers up to "
-            f"{mujoco.mjMAXVAL:g}"
+            f"{what} is {array.tolist()}; it must be {expected} up to {mujoco.mjMAXVAL:g}"
         )
     return [float(number) for number in array]
 

@@ -44,6 +44,13 @@ from hapticbridge.whatif.settings import Change, Settings, Value, changed_of_han
 
 # Result of a what-if
 
+NO_ANSWER = (
+    "the watch for a late or reversed force acted in the prescribed run, because a recorded motion "
+    "does not answer the changed force: the force is lowered there, and this says nothing of the "
+    "device"
+)
+"""Note on a prescribed run whose force was lowered for a motion that no force can change."""
+
 RECORDED, PRESCRIBED, CLOSED = "recorded", "prescribed", "closed loop"
 """Names of the runs."""
 
@@ -279,6 +286,8 @@ class _Experiment:
         runs.append(self._prescribed(new))
         if not is_changed:
             notes.append(self._agreement())
+        elif _alarms(runs[-1]) & ~_alarms(recorded):
+            notes.append(NO_ANSWER)
         notes.extend(_missing_parts(run, Repetition(self.hands, new)))
         if run.trip:
             notes.append("the recorded run ends in a trip, so these runs end there too")
@@ -400,6 +409,12 @@ class _Experiment:
             f"with nothing changed the prescribed run differs from the recorded one from tick "
             f"{first.ticks[0]} on, in {first.column}, by {first.size:.3g} {first.unit}"
         )
+
+
+def _alarms(run: WhatIfRun) -> int:
+    """Returns the findings of the watch for a late or reversed force, as flags."""
+    every = [np.bitwise_or.reduce(each.ticks["flags"], initial=0) for each in run.recordings]
+    return int(np.bitwise_or.reduce(every)) & int(TickFlag.SWINGING | TickFlag.RUNS_AWAY)
 
 
 def _missing_parts(run: RecordedRun, repetition: Repetition) -> Iterator[str]:
