@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hapticbridge.device.own_loop import SURFACES
 from hapticbridge.device.rawhid import protocol
-from hapticbridge.kernel import law, shown_tool
+from hapticbridge.kernel import parameters, shown_tool
 
 TARGET = Path(protocol.__file__).with_name("firmware") / "hb_constants.h"
 
@@ -30,7 +30,7 @@ def header() -> str:
         "HB_TRIALS": shown_tool.TRIALS,
     }
     reals = {"HB_NEAR": shown_tool.NEAR, "HB_SLOWEST": shown_tool.SLOWEST}
-    reals |= {"HB_LONGEST": shown_tool.LONGEST, "HB_LARGEST_TWIST": law.LARGEST_TWIST}
+    reals |= {"HB_LONGEST": shown_tool.LONGEST, "HB_LARGEST_TWIST": parameters.LARGEST_TWIST}
     reals |= {"HB_SPEED_STEP": protocol.SPEED_STEP, "HB_TURN_STEP": protocol.TURN_STEP}
     lines = [f"static const int {name} = {value};" for name, value in numbers.items()]
     lines += [f"static const float {name} = {value!r}f;" for name, value in reals.items()]

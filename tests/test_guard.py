@@ -35,8 +35,7 @@ from hapticbridge.demand.guard import (
 )
 from hapticbridge.device.watchdog import ForceOffGuardian
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
-from hapticbridge.kernel.law import LARGEST_TWIST
-from hapticbridge.kernel.parameters import UNGUARDED, GuardParameters
+from hapticbridge.kernel.parameters import LARGEST_TWIST, UNGUARDED, GuardParameters
 from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
 from hapticbridge.run.bridge import Bridge

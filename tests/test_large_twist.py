@@ -23,7 +23,7 @@ from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.methods import method_named
-from hapticbridge.kernel.law import LARGEST_TWIST
+from hapticbridge.kernel.parameters import LARGEST_TWIST
 from hapticbridge.kernel.record import POST_DTYPE
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.endpoint import posted_scene, program_options

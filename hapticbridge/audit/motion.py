@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.events import AuditState, RunEvents
-from hapticbridge.kernel.law import LARGEST_TWIST
-from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.parameters import LARGEST_TWIST, RunParameters
 from hapticbridge.kernel.record import TickFlag, has_flag
 
 Array = NDArray[np.float64]

@@ -20,8 +20,13 @@ from hapticbridge.device.registry import DRIVERS
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.jit import direct
-from hapticbridge.kernel.law import STOPPED_TWIST
-from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, OFF, GuardParameters
+from hapticbridge.kernel.parameters import (
+    DAMPER,
+    ENVIRONMENT,
+    OFF,
+    STOPPED_TWIST,
+    GuardParameters,
+)
 from hapticbridge.kernel.tick_guard import FARTHEST
 from hapticbridge.units import format_number
 

@@ -42,7 +42,14 @@ from hapticbridge.kernel.handle import (
 from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.ledger import SLACK_SHARE, moment_dot
 from hapticbridge.kernel.mujoco_c import floats
-from hapticbridge.kernel.parameters import ALL_MOTORS, SENT, RunParameters, whole_ticks
+from hapticbridge.kernel.parameters import (
+    ALL_MOTORS,
+    LARGEST_TWIST,
+    SENT,
+    STOPPED_TWIST,
+    RunParameters,
+    whole_ticks,
+)
 from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
@@ -96,12 +103,6 @@ COUPLING_DTYPE = np.dtype(
 """Sub-record ``coupling``, written by this module alone. ``hold`` is the most force in N and torque
 in N m along axes without motor, ``idle`` those while the hand is let go. ``twist_damping`` in
 N m s/rad, seen at the tool, is the damping that pays for a torque across the motion."""
-
-LARGEST_TWIST, STOPPED_TWIST = 2.5, 2.8
-"""Twist in rad from which the handle slips that a hand holds behind a late device, or in a run that
-is not stopped at the second. They leave 0.64 and 0.34 rad for the turns of one tick to half a turn,
-where the torque reverses. Larger ones leave less. A hand that turns farther slips as if it had not
-come across."""
 
 _GAINS = 10  # numbers per actuator in actuator_gainprm and actuator_biasprm (mjNGAIN, mjNBIAS)
 

@@ -47,6 +47,12 @@ value makes pulses weaker where no damping is spare."""
 SENT = 64
 """Ticks of which what was sent is kept; a device is at most 50 samples late."""
 
+LARGEST_TWIST, STOPPED_TWIST = 2.5, 2.8
+"""Twist in rad from which the handle slips that a hand holds behind a late device, or in a run that
+is not stopped at the second. They leave 0.64 and 0.34 rad for the turns of one tick to half a turn,
+where the torque reverses. Larger ones leave less. A hand that turns farther slips as if it had not
+come across."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardParameters:

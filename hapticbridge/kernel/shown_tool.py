@@ -74,7 +74,6 @@ from hapticbridge.kernel.force_level import limited_wrench
 from hapticbridge.kernel.handle import device_from_scene, grip_pose, note_tool, scene_from_device
 from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import (
-    LARGEST_TWIST,
     Spring,
     energy_at_level,
     law_wrench,
@@ -87,7 +86,7 @@ from hapticbridge.kernel.law import (
 )
 from hapticbridge.kernel.ledger import take_scene_energies
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
-from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.parameters import LARGEST_TWIST, RunParameters
 from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
