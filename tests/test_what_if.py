@@ -472,5 +472,6 @@ def test_a_motion_that_answers_no_force_is_not_called_a_device_that_answers_late
     acted = {run.name: bool((run.ticks["flags"] & alarms).any()) for run in found.runs}
     assert (acted["recorded"], acted["prescribed"]) == (False, True)
     (note,) = (each for each in found.notes if "does not answer" in each)
-    assert "says nothing of the device" in note
+    assert "the device is not judged" in note
+    assert [run.report.certified for run in found.runs[:2]] == [True, None]
     assert not any("does not answer" in each for each in what_if(path, {}).notes)

@@ -6,7 +6,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -46,8 +46,7 @@ from hapticbridge.whatif.settings import Change, Settings, Value, changed_of_han
 
 NO_ANSWER = (
     "the watch for a late or reversed force acted in the prescribed run, because a recorded motion "
-    "does not answer the changed force: the force is lowered there, and this says nothing of the "
-    "device"
+    "does not answer the changed force: the force is lowered there, and the device is not judged"
 )
 """Note on a prescribed run whose force was lowered for a motion that no force can change."""
 
@@ -287,6 +286,8 @@ class _Experiment:
         if not is_changed:
             notes.append(self._agreement())
         elif _alarms(runs[-1]) & ~_alarms(recorded):
+            unjudged = replace(runs[-1].report, certification=None)
+            runs[-1] = replace(runs[-1], report=unjudged)
             notes.append(NO_ANSWER)
         notes.extend(_missing_parts(run, Repetition(self.hands, new)))
         if run.trip:
