@@ -454,6 +454,16 @@ def test_a_time_of_day_is_told_from_seconds(time: str, tmp_path: Path) -> None:
         read_motion(path)
 
 
+def test_check_takes_what_trajectory_takes(tmp_path: Path) -> None:
+    folder, scene = bag(tmp_path / "walk", {"/hand": ramp()}), load_scene("point_mass")
+    expected = motion_for(scene, next(folder.glob("*.mcap")))
+    assert expected is not None
+    for place in (folder, f"{folder}:/hand"):
+        found = motion_for(scene, place)
+        assert found is not None
+        assert np.array_equal(found.table, expected.table)
+
+
 def test_a_split_bag_is_told_with_what_joins_it(tmp_path: Path) -> None:
     folder = bag(tmp_path / "walk", {"/hand": ramp()})
     (file,) = folder.glob("*.mcap")

@@ -19,9 +19,9 @@ from hapticbridge.demand.certificate import default_coupling
 from hapticbridge.demand.methods import RIGID, default_method
 from hapticbridge.demand.pulse import Tap
 from hapticbridge.demand.rehearsal import RunPoint
-from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice, read_motion
+from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice
 from hapticbridge.device.base import checked_number
-from hapticbridge.device.motion_file import is_bag, read_bag, read_recorded
+from hapticbridge.device.motion_file import motion_in, read_motion, read_recorded
 from hapticbridge.device.trajectory import DEFAULT_SECONDS, lissajous
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.mujoco_c import quiet
@@ -33,14 +33,12 @@ from hapticbridge.scene.source_map import Places
 
 # Motion for a check: the scene's own hand path, a file of poses, or a recording
 
-RECORDING = ".mcap"
-
 
 def motion_for(scene: Scene, path: str | Path | None = None) -> Motion | None:
     """Returns the handle's motion relative to its first pose.
 
-    ``path`` is a CSV file (``t,x,y,z[,qw,qx,qy,qz]``) or a recording; None takes ``NAME.csv``
-    beside the scene.
+    ``path`` is a CSV file (``t,x,y,z[,qw,qx,qy,qz]``), a recording or a bag of poses; None takes
+    ``NAME.csv`` beside the scene.
 
     Returns:
         The motion; None if no file was named and none lies beside the scene.
@@ -52,11 +50,10 @@ def motion_for(scene: Scene, path: str | Path | None = None) -> Motion | None:
     if path is None:
         beside = scene.path.with_suffix(".csv")
         return read_motion(beside).relative() if beside.is_file() else None
-    if Path(path).suffix != RECORDING:
-        return read_motion(path).relative()
-    if is_bag(Path(path)):
-        return read_bag(Path(path)).relative()
-    ticks, period = read_recorded(Path(path))
+    found = motion_in(str(path))
+    if isinstance(found, Motion):
+        return found.relative()
+    ticks, period = read_recorded(found)
     # the handle's pose already includes scale and axes; the device's does not
     return Motion(
         ticks["tick"] * period, ticks["handle_position"], ticks["handle_quaternion"]

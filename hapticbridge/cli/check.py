@@ -366,8 +366,8 @@ class Check:
     """Set a parameter of the scene, as often as wanted: --set clearance=0.1e-3."""
     grip: str = shared(Grasp, "grip", "grip")
     motion: Path | None = None
-    """Motion of the handle (CSV or recording); by default NAME.csv beside the scene, or else the
-    simulated hand's own: slow, 1 cm."""
+    """Motion of the handle (CSV, recording or bag of poses); by default NAME.csv beside the
+    scene, or else the simulated hand's own: slow, 1 cm."""
     rate: float | None = shared(BridgeOptions, "rate", None)
     """Ticks per second; by default 1000, and then a scene with another time step is told so."""
     stiffness: float | None = shared(Coupling, "stiffness", None)

@@ -27,7 +27,76 @@ from hapticbridge.device.trajectory import (
     first_fault,
 )
 from hapticbridge.errors import DeviceError, RecordingError, choices
+from hapticbridge.files import foreign_kind
 from hapticbridge.units import format_number
+
+# Any of them
+
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+
+
+def motion_in(text: str) -> Motion | Path:
+    """Reads the motion of a table, or of a bag as ``FILE:/TOPIC`` or as the folder of one file.
+
+    Returns:
+        The motion; the path of a recording, which ``read_recorded`` reads.
+
+    Raises:
+        DeviceError: There is none, or it is damaged.
+    """
+    path, topic = _named_topic(text)
+    if not _is_recording(path):
+        _refuse_other_bag(path)
+        if topic:
+            raise DeviceError(f"{path}: a topic, '{topic}', is of a bag in MCAP, which this is not")
+        return read_motion(path)
+    return read_bag(path, topic) if topic or _is_bag(path) else path
+
+
+def _named_topic(text: str) -> tuple[Path, str]:
+    """Returns file and topic of ``FILE:/TOPIC``, or a folder's one bag; the topic may be empty."""
+    file, colon, topic = text.partition(":/")
+    try:
+        is_named = bool(colon) and not Path(text).exists() and Path(file).exists()
+        path = Path(file if is_named else text)
+        bags = sorted(path.glob("*.mcap")) if path.is_dir() else []
+    except (OSError, ValueError):  # reading it as a motion then reports the reason
+        return Path(text), ""
+    return bags[0] if len(bags) == 1 else path, f"/{topic}" if is_named else ""
+
+
+def _refuse_other_bag(path: Path) -> None:
+    """Refuses a bag of another kind, and a folder of several bags.
+
+    Raises:
+        DeviceError: It is one.
+    """
+    try:
+        files = sorted(path.iterdir()) if path.is_dir() else [path]
+    except OSError:  # reading it as a motion then reports the reason
+        return
+    bags = [file.name for file in files if file.suffix == ".mcap"]
+    if len(bags) > 1:
+        one = f"name one of {choices(bags[:8])}"
+        if (path / "metadata.yaml").is_file():
+            one += ", or let 'ros2 bag convert' write the whole bag into one"
+        raise DeviceError(f"{path}: a folder of {len(bags)} files; {one}")
+    if kind := next(filter(None, map(foreign_kind, files)), ""):
+        raise DeviceError(f"{path}: {kind}")
+
+
+def _is_recording(path: Path) -> bool:
+    """Recognises a recording by its first bytes, or by its suffix."""
+    if path.suffix == ".mcap":
+        return True
+    try:
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            return file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
+    except (OSError, ValueError):
+        return False  # reading it as a motion then reports the reason
+
 
 # Table in CSV
 
@@ -288,7 +357,7 @@ _DAMAGED = ValueError, RuntimeError, EOFError, OverflowError, MemoryError, ZstdE
 """Errors besides its own with which the package mcap meets a damaged file."""
 
 
-def is_bag(path: Path) -> bool:
+def _is_bag(path: Path) -> bool:
     """Returns True for a whole MCAP file without the topic ``/tick`` of a recording."""
     try:
         return "/tick" not in dict(_topics(path))

@@ -35,7 +35,7 @@ from hapticbridge.device.base import (
     telling,
 )
 from hapticbridge.device.driver import Driver, FoundDevice, Notify, Options, ignore_message
-from hapticbridge.device.motion_file import is_bag, read_bag, read_motion, read_recorded
+from hapticbridge.device.motion_file import motion_in, read_recorded
 from hapticbridge.device.profile import modelled, profile_named, profile_of
 from hapticbridge.device.simulated.device import (
     GrippingDevice,
@@ -44,9 +44,8 @@ from hapticbridge.device.simulated.device import (
     scene_hand,
 )
 from hapticbridge.device.simulated.dynamics import Hand
-from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
+from hapticbridge.device.trajectory import Motion, ReplayDevice, TrajectoryDevice
 from hapticbridge.errors import DeviceError, choices, nearest
-from hapticbridge.files import foreign_kind
 from hapticbridge.kernel.codes import Grip
 from hapticbridge.scene import Scene
 
@@ -250,7 +249,6 @@ def refuse_unknown(device: str, options: Iterable[str], valid: Iterable[str]) ->
         )
 
 
-_MCAP_MAGIC = b"\x89MCAP0\r\n"
 _HAND_PREFIX = "hand_"
 _HAND_OPTIONS = tuple(_HAND_PREFIX + name for name in inspect.signature(Hand).parameters)
 _STATED_PREFIX = "stated_"
@@ -451,64 +449,14 @@ def _open_trajectory(rest: str, options: Mapping[str, object]) -> Device:
     limits: dict[str, Any] = dict(options)
     if not rest:
         raise DeviceError("trajectory needs a file: 'trajectory:FILE', a CSV file or a recording")
-    path, topic = _named_topic(rest)
-    if not _is_recording(path):
-        _refuse_other_bag(path)
-        if topic:
-            raise DeviceError(f"{path}: a topic, '{topic}', is of a bag in MCAP, which this is not")
-        return TrajectoryDevice(read_motion(path), **limits)
-    if topic or is_bag(path):
-        return TrajectoryDevice(read_bag(path, topic), **limits)
-    ticks, period = read_recorded(path)
-    return ReplayDevice(ticks, period, name=str(path), **limits)
+    found = motion_in(rest)
+    if isinstance(found, Motion):
+        return TrajectoryDevice(found, **limits)
+    ticks, period = read_recorded(found)
+    return ReplayDevice(ticks, period, name=str(found), **limits)
 
 
 _OPENERS: dict[str, Callable[[str, Mapping[str, object]], Device]] = {
     "simulated": _open_simulated,
     "trajectory": _open_trajectory,
 }
-
-
-def _named_topic(text: str) -> tuple[Path, str]:
-    """Returns file and topic of ``FILE:/TOPIC``, or a folder's one bag; the topic may be empty."""
-    file, colon, topic = text.partition(":/")
-    try:
-        is_named = bool(colon) and not Path(text).exists() and Path(file).exists()
-        path = Path(file if is_named else text)
-        bags = sorted(path.glob("*.mcap")) if path.is_dir() else []
-    except (OSError, ValueError):  # reading it as a motion then reports the reason
-        return Path(text), ""
-    return bags[0] if len(bags) == 1 else path, f"/{topic}" if is_named else ""
-
-
-def _refuse_other_bag(path: Path) -> None:
-    """Refuses a bag of another kind, and a folder of several bags.
-
-    Raises:
-        DeviceError: It is one.
-    """
-    try:
-        files = sorted(path.iterdir()) if path.is_dir() else [path]
-    except OSError:  # reading it as a motion then reports the reason
-        return
-    bags = [file.name for file in files if file.suffix == ".mcap"]
-    if len(bags) > 1:
-        one = f"name one of {choices(bags[:8])}"
-        if (path / "metadata.yaml").is_file():
-            one += ", or let 'ros2 bag convert' write the whole bag into one"
-        raise DeviceError(f"{path}: a folder of {len(bags)} files; {one}")
-    if kind := next(filter(None, map(foreign_kind, files)), ""):
-        raise DeviceError(f"{path}: {kind}")
-
-
-def _is_recording(path: Path) -> bool:
-    """Recognises a recording by its first bytes, or by its suffix."""
-    if path.suffix == ".mcap":
-        return True
-    try:
-        if not path.is_file():
-            return False
-        with path.open("rb") as file:
-            return file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
-    except (OSError, ValueError):
-        return False  # reading it as a motion then reports the reason
