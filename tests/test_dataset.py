@@ -215,6 +215,7 @@ def test_what_cannot_be_learned_from_is_refused_and_leaves_nothing(
     cases: list[tuple[list[Path], str, Shot, str]] = [
         ([], "lerobot", Shot(), "a recording at least"),
         ([cut], "lerobot", Shot(), "its end is missing"),
+        ([*runs, runs[0]], "lerobot", Shot(), f"'{runs[0].name}' is named more than once"),
         ([runs[0], other], "lerobot", Shot(), f"other joints, .* than '{runs[0].name}'; the epis"),
         ([other], "robomimic", Shot(fps=1), "shorter than two frames"),
         ([other, runs[0]], "lerobot", Shot(), "the scenes 'point_mass', 'ratchet', and one's name"),

@@ -22,6 +22,7 @@ import io
 import json
 import math
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -491,16 +492,19 @@ def write_dataset(
         progress: Called with the finished and all frames, and the recording's name.
 
     Raises:
-        RecordingError: The task is no Unicode text, there is no recording, one is damaged, cut, of
-            another scene than the first or cannot be simulated again, or has fewer states of its
-            scene than frames; scenes of several names have no task; the format is unknown, or the
-            folder exists or cannot be written.
+        RecordingError: The task is no Unicode text, there is no recording, one is named twice,
+            damaged, cut, of another scene than the first or cannot be simulated again, or has fewer
+            states of its scene than frames; scenes of several names have no task; the format is
+            unknown, or the folder exists or cannot be written.
         HapticBridgeError: Nothing can be drawn here, or the scene has no such camera.
     """
     if form not in DATASETS:
         raise RecordingError(f"format {form!r:.60} is unknown; the formats are {choices(DATASETS)}")
     if not paths:
         raise RecordingError("a data set needs a recording at least")
+    if len(files := Counter(Path(path).resolve() for path in paths)) < len(paths):
+        twice, _ = files.most_common(1)[0]
+        raise RecordingError(f"'{twice.name}' is named more than once; each is one episode")
     if task is not None and not is_unicode(task):
         raise RecordingError(f"the task {task!r:.60} is not in UTF-8")
     shot, folder = shot or Shot(), Path(folder)
