@@ -171,8 +171,10 @@ def wrench_by_law(
     (step, turn), period = motion.stretched, parameters.period
     k, b, k_r, b_r = (gains[:, column, None] for column in range(4))
     force = k * motion.stretch + b / period * step
-    handle = ticks["handle_quaternion"]
-    twist = _turned_on(turn_between(motion.tool_before[:, 3:], handle), motion.twist)
+    twist = motion.twist
+    if not parameters.scene_ticks:  # a tool that is only shown takes no step across half a turn
+        handle = ticks["handle_quaternion"]
+        twist = _turned_on(turn_between(motion.tool_before[:, 3:], handle), twist)
     torque = k_r * twist + b_r / period * turn
     is_midpoint = has_flag(ticks, TickFlag.MIDPOINT)
     if np.any(is_midpoint):

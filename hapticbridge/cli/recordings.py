@@ -56,9 +56,9 @@ class View:
         address = Address(0 if self.save is not None else self.port)
         from hapticbridge.view.replay import Replay, Theatre  # noqa: PLC0415 - of an extra
 
-        _tell_faults(open_recording(self.file, 0))
         with progress("simulating again") as show:
             replay = Replay(self.file, show, in_process=self.in_process)
+        _tell_faults(open_recording(self.file, 0))
         theatre = Theatre(replay, address)
         if self.save is not None:
             with err.status("writing …"), atomic_write(self.save) as draft:
@@ -109,7 +109,6 @@ class Render:
         """Draws; returns the exit code."""
         check_target(self.output, RecordingError)
         refuse_existing(self.output, RecordingError, overwrite=self.overwrite)
-        _tell_faults(open_recording(self.file, 0))
         shot = self.shot
         if shot.at is None and self.output.suffix.lower() == ".png":
             from hapticbridge.report import telling_time  # noqa: PLC0415 - imports matplotlib
@@ -117,6 +116,7 @@ class Render:
             shot = replace(shot, at=telling_time(read_recording(self.file, 0)))
         with progress("drawing") as show:
             renderer = draw(self.file, self.output, shot, show, in_process=self.in_process)
+        _tell_faults(open_recording(self.file, 0))
         out.print(f"wrote {plain(str(self.output))} (drawn with {renderer})")
         return 0
 

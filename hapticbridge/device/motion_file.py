@@ -335,7 +335,7 @@ def read_recorded(path: Path) -> tuple[NDArray[np.void], float]:
 
     recording = read_recording(path)
     if recording.problems:
-        raise DeviceError(f"{path} is damaged, so that it is no motion: {recording.problems[0]}")
+        raise DeviceError(f"{path} is damaged: {recording.problems[0]}; so it is no motion")
     if not math.isfinite(period := recording.period):
         raise DeviceError(
             f"{path}: the recording lacks its period (period_s), so it cannot be replayed"

@@ -89,7 +89,7 @@ def compared_wrench(
     else:
         unknown = (np.nan, np.nan, np.nan)
         return unknown, unknown, unknown, unknown
-    note_tool(s.pose, position, orientation)
+    note_tool(s.pose, position, orientation, turned)
     return wrench[0], wrench[1], moved, turned
 
 

@@ -41,6 +41,7 @@ from hapticbridge.kernel.law import (
     law_wrench,
     limited,
     next_gain_ratio,
+    pulled_after_step,
     set_gains,
     springs,
 )
@@ -270,7 +271,8 @@ def _law_after_step(
     motion = tool_motion(s)
     position, orientation, moved, turned = motion
     handle = handle_of_step(s, is_last)
-    force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
+    stretch, twist = pulled_after_step(s, handle, (position, orientation))
+    force, torque = law_wrench(s, stretch, twist, moved, turned)
     return force, torque, motion
 
 
@@ -319,7 +321,7 @@ def limited_wrench_after_step(
     else:
         s.level.flags = 0
     position, orientation, moved, turned = motion
-    note_tool(s.pose, position, orientation)
+    note_tool(s.pose, position, orientation, turned)
     return force, torque, moved, turned
 
 
@@ -329,5 +331,5 @@ def settled_wrench(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vec
     force, torque, motion = _law_after_step(s, is_last)
     force, torque = limited_wrench(s, force, torque)
     position, orientation, moved, turned = motion
-    note_tool(s.pose, position, orientation)
+    note_tool(s.pose, position, orientation, turned)
     return force, torque, moved, turned

@@ -56,7 +56,7 @@ POSE_DTYPE = np.dtype(
 )
 """Sub-record ``pose``, written by this module alone. Positions in m, quaternions (w, x, y, z);
 ``handle_step`` in m and ``handle_turn`` in rad are the handle's motion in the present tick,
-``tool_turn`` in rad is the tool's before the pose that was noted last."""
+``tool_turn`` in rad is the tool's in its last step."""
 
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -214,10 +214,9 @@ def move_handle_home(pose: Part, *, at_tool: bool = False) -> None:
 
 
 @compiled
-def note_tool(pose: Part, position: Vector, quaternion: Quaternion) -> None:
-    """Notes the tool's new pose, and its turn since the last one."""
-    turn = rotation_between(quaternion_of(pose.tool_quaternion), quaternion)
-    store_vector(pose.tool_turn, turn)
+def note_tool(pose: Part, position: Vector, quaternion: Quaternion, turned: Vector) -> None:
+    """Notes the tool's new pose, and its turn in the step; none for a tool that is only shown."""
+    store_vector(pose.tool_turn, turned)
     store_vector(pose.tool_position, position)
     store_quaternion(pose.tool_quaternion, quaternion)
 

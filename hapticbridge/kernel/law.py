@@ -332,26 +332,19 @@ def _slack(
 
 @compiled
 def law_wrench(
-    s: State,
-    handle: tuple[Vector, Quaternion],
-    tool: tuple[Vector, Quaternion],
-    moved: Vector,
-    turned: Vector,
+    s: State, stretch: Vector, twist: Vector, moved: Vector, turned: Vector
 ) -> tuple[Vector, Vector]:
     """Returns the coupling's force and torque on the tool, for one evaluation of the law.
 
     Args:
         s: The bound state.
-        handle: Position in m and orientation at the end of the step.
-        tool: Position in m and orientation at the end of the step.
+        stretch: From the tool to the handle in m, at the end of the step.
+        twist: The same in rad.
         moved: Motion of the tool in m since the previous evaluation.
         turned: Its rotation vector in rad.
     """
     k, count = s.coupling, s.run.law_evaluations
     share, rate = 1.0 / count, count / s.run.period
-    stretch = subtract(handle[0], tool[0])
-    before = rotation_between(quaternion_of(s.pose.tool_quaternion), handle[1])
-    twist = turned_on(before, rotation_between(tool[1], handle[1]))
     handle_step = scaled(share, vector_of(s.pose.handle_step))
     handle_turn = scaled(share, vector_of(s.pose.handle_turn))
     force = add(
@@ -665,6 +658,19 @@ def turned_on(before: Vector, twist: Vector) -> Vector:
     if size <= LARGEST_TWIST or dot(before, twist) >= 0.0:
         return twist
     return scaled(1.0 - 2.0 * math.pi / size, twist)
+
+
+@compiled
+def pulled_after_step(
+    s: State, handle: tuple[Vector, Quaternion], tool: tuple[Vector, Quaternion]
+) -> tuple[Vector, Vector]:
+    """Returns stretch in m and twist in rad at the end of a step, before the tool is noted.
+
+    The twist goes on beyond half a turn, as in MuJoCo's step, which is linear in the turn.
+    """
+    before = rotation_between(quaternion_of(s.pose.tool_quaternion), handle[1])
+    twist = turned_on(before, rotation_between(tool[1], handle[1]))
+    return subtract(handle[0], tool[0]), twist
 
 
 @compiled

@@ -53,7 +53,14 @@ from hapticbridge.kernel.explicit_bias import take_back, write_bias
 from hapticbridge.kernel.force_level import limited_wrench, limited_wrench_after_step
 from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
 from hapticbridge.kernel.jit import compiled
-from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains, torque_across, turned_on
+from hapticbridge.kernel.law import (
+    applied_wrench,
+    law_wrench,
+    pulled_after_step,
+    set_gains,
+    torque_across,
+    turned_on,
+)
 from hapticbridge.kernel.ledger import (
     add_body_wrenches,
     set_kinetic_energy,
@@ -451,13 +458,14 @@ def lossless_wrench(states: NDArray[np.void]) -> tuple[Vector, Vector, Vector, V
     half_force, half_torque = rotated(handle_frame, half[0]), rotated(handle_frame, half[1])
     position, orientation, moved, turned = tool_after_step(s)
     tool = position, orientation
-    force, law = law_wrench(s, handle_of_step(s, True), tool, moved, turned)
+    stretch, twist = pulled_after_step(s, handle_of_step(s, True), tool)
+    force, law = law_wrench(s, stretch, twist, moved, turned)
     torque = midpoint_torque(s, orientation, turned, law)
     # the torque is carried in the tool's frame, so that it turns with the tool
     to_before = conjugate(quaternion_of(s.pose.tool_quaternion))
     store_vector(lossless.applied_half[0:3], half_force)
     store_vector(lossless.applied_half[3:6], rotated(orientation, rotated(to_before, half_torque)))
-    note_tool(s.pose, position, orientation)
+    note_tool(s.pose, position, orientation, turned)
     # above the level the rest that is carried over is smaller than the half, which dissipates
     force, torque = limited_wrench(s, force, torque)
     if s.level.flags:

@@ -499,13 +499,13 @@ def _shown_at(
     last = quaternion_of(s.pose.tool_quaternion)
     position = add(vector_of(s.pose.tool_position), moved)
     orientation = canonical(product(quaternion_exp(turned), last))
-    handle = vector_of(s.pose.handle_position), quaternion_of(s.pose.handle_quaternion)
-    twist = rotation_between(orientation, handle[1])
+    _, twist = _pulled(s, position, orientation)
     if _is_late(s) and norm(twist) > LARGEST_TWIST:
         back = subtract(twist, within(twist, LARGEST_TWIST))
         orientation = canonical(product(quaternion_exp(back), orientation))
         turned = rotation_between(last, orientation)
-    force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
+    stretch, twist = _pulled(s, position, orientation)
+    force, torque = law_wrench(s, stretch, twist, moved, turned)
     force, torque = limited_wrench(s, force, torque)
     return position, orientation, force, torque, moved, turned
 
@@ -609,5 +609,5 @@ def shown_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
     shown.silence += 1
     shown.longest_silence = max(shown.longest_silence, shown.silence)
     position, orientation, force, torque, moved, turned = _shown_at(s, share, step, turn)
-    note_tool(pose, position, orientation)
+    note_tool(pose, position, orientation, (0.0, 0.0, 0.0))
     return force, torque, moved, turned
