@@ -479,7 +479,7 @@ def test_a_damaged_recording_is_no_motion_and_a_cut_one_says_so(tmp_path: Path) 
     whole = run.read_bytes()
     run.write_bytes(whole + b"more")
     for read in (lambda: open_device(f"trajectory:{run}"), lambda: motion_for(scene, run)):
-        with pytest.raises(DeviceError, match="is damaged: its end is fo.*; so it is no motion"):
+        with pytest.raises(DeviceError, match=r"is damaged: its end is fo.*; so it is no motion"):
             read()
     run.write_bytes(whole[: int(0.97 * len(whole))])
     for read in (lambda: open_device(f"trajectory:{run}"), lambda: motion_for(scene, run)):
