@@ -83,7 +83,9 @@ def test_sensors_are_asked_for_at_the_command_line(run: Path, tmp_path: Path, ca
 
 
 def test_robomimic_has_actions_within_one_and_how_to_undo_it(run: Path, tmp_path: Path) -> None:
-    folder = write_dataset([run, run], "robomimic", tmp_path / "set").folder
+    other = tmp_path / "other.mcap"
+    other.write_bytes(run.read_bytes())
+    folder = write_dataset([run, other], "robomimic", tmp_path / "set").folder
     with h5py.File(folder / "demos.hdf5") as file:
         data = file["data"]
         scale, offset = data.attrs["action_scale"], data.attrs["action_offset"]
