@@ -33,6 +33,7 @@ from hapticbridge.units import format_number
 # Any of them
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
+"""First and last bytes of an MCAP file, here without loading the package mcap."""
 
 
 def motion_in(text: str) -> Motion | Path:
@@ -480,12 +481,10 @@ _NO_END = "its end is missing or followed by more; 'mcap recover' writes what is
 
 def _ends_whole(path: Path) -> bool:
     """Returns True for a file that ends as an MCAP file does, or cannot be read at all."""
-    from mcap.writer import MCAP0_MAGIC  # noqa: PLC0415
-
     try:
         with path.open("rb") as file:
-            file.seek(-len(MCAP0_MAGIC), os.SEEK_END)
-            return file.read() == MCAP0_MAGIC
+            file.seek(-len(_MCAP_MAGIC), os.SEEK_END)
+            return file.read() == _MCAP_MAGIC
     except OSError:
         return True
 
