@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path as Files
 from typing import Any
 
@@ -23,6 +24,7 @@ from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.methods import method_named
+from hapticbridge.errors import SafetyTrip
 from hapticbridge.kernel.parameters import LARGEST_TWIST
 from hapticbridge.kernel.record import POST_DTYPE
 from hapticbridge.run.bridge import Bridge
@@ -155,6 +157,18 @@ def test_a_run_with_a_tool_that_spins_across_half_a_turn_is_certified(
     assert np.ptp(np.unwrap(turned)) > 150.0
     report = audit(path, in_process=True)
     assert (report.verdict, report.certified) == ("passive", True), report.reason
+
+
+def test_the_angle_limit_sees_a_turn_across_half_a_turn() -> None:
+    """At 1.2 rad a tick it is 3.6 rad away in the third, and 2.7 rad on the other side."""
+    scene = load_scene(mujoco.MjSpec.from_string(TOOL.format(inertia=1.0, speed=1200.0)))
+    limits, law = replace(LIMITS, angle=2.8), {"rotational_stiffness": STIFFNESS}
+    clock = SimulatedClock()
+    with (
+        pytest.raises(SafetyTrip, match=r"tick 3: the tool is turned .* more than the angle limit"),
+        Bridge(scene, "simulated:hand=none", law, clock=clock, limits=limits) as bridge,
+    ):
+        bridge.run(0.02)
 
 
 # A tool that another program shows
