@@ -14,6 +14,7 @@ from hapticbridge.demand.methods import RIGID
 from hapticbridge.demand.rehearsal import RunPoint, rehearsal_parameters
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import OK, WARNINGS, warning_words
+from hapticbridge.kernel.elastic import unstored_energy
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.mujoco_c import warning_of
 from hapticbridge.kernel.record import TICK_DTYPE
@@ -22,7 +23,7 @@ from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
 from hapticbridge.run.summary import Ledger
 from hapticbridge.scene import Scene
-from hapticbridge.scene.physics import TendonWatch, WayJump
+from hapticbridge.scene.physics import TendonWatch, WayJump, firm_edges, unstored_words
 
 # Clearance of the tool between opposite walls
 
@@ -161,6 +162,10 @@ def _trees_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
 
 # RunPoint of a scene under a motion
 
+NOTABLE = 1.0
+"""Energy in J from which on a flex that never stored it is the cause of a scene that diverges. A
+hand puts in less in a motion of a check."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Playback:
@@ -216,16 +221,22 @@ def rehearse(scene: Scene, samples: NDArray[np.void], setting: RunPoint) -> Play
     )
 
 
-def not_finite(scene: Scene, tick: int, ticks: int) -> SceneError:
-    """Returns the error for a motion with a result that is not usable at a tick."""
+def not_finite(
+    scene: Scene, tick: int, ticks: int, state: NDArray[np.void] | None = None
+) -> SceneError:
+    """Returns the error for a motion with a result that is not usable at a tick.
+
+    With the bound state, it names a flex that gave energy which it never stored.
+    """
     code = warning_of(scene.data)
     if code in WARNINGS:
         return SceneError(
             f"scene '{scene.name}', tick {tick} of {ticks} of the motion: {warning_words(code)}"
         )
-    return SceneError(
-        f"scene '{scene.name}' is not finite after tick {tick} of {ticks} of the motion"
-    )
+    words = f"scene '{scene.name}' is not finite after tick {tick} of {ticks} of the motion"
+    if state is not None and (given := unstored_energy(state[0])) > NOTABLE:
+        words += f"; {unstored_words(scene.model, given)}; {firm_edges(scene.model.opt.timestep)}"
+    return SceneError(words)
 
 
 _TYPE = mujoco.mjtConstraint
@@ -338,10 +349,10 @@ def observe(
             done = k
             break
         if before(state, samples[k : k + 1], row, 0, period) != OK:
-            raise not_finite(scene, k, samples.size)
+            raise not_finite(scene, k, samples.size, state)
         step(model, data)
         if after(state, row, 0) != OK:
-            raise not_finite(scene, k, samples.size)
+            raise not_finite(scene, k, samples.size, state)
         work += model.nv + data.nefc
         if data.nefc:
             counted = np.bincount(data.efc_type)

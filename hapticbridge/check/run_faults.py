@@ -38,7 +38,8 @@ def run_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             "motion not finished",
             option("timestep"),
             f"under {case.motion_name}: {case.motion_fault}",
-            "mend the faults above first; if there are none, a softer contact or a heavier tool",
+            "mend what is named here and the faults above first; if there is nothing, a softer "
+            "contact or a heavier tool",
         )
         return
     if seen.full_ticks > FULL_TICKS * case.samples.size:

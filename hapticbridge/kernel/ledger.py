@@ -43,6 +43,7 @@ from hapticbridge.kernel.codes import (
     Scheme,
     State,
 )
+from hapticbridge.kernel.elastic import elastic_energy, follow_elastic
 from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.mujoco_c import (
     floats,
@@ -503,11 +504,12 @@ def refresh_inertia(s: State) -> None:
 def potential_energy(s: State) -> float:
     """Returns the energy in J that the scene stores at the present positions.
 
-        V = V_0 + Σ c_i m_i g·x_i
+        V = V_0 + V_U + Σ c_i m_i g·x_i
 
-    V_0 is MuJoCo's energy of gravity and springs. Gravity compensation depends on positions alone,
-    so it stores energy, and a weight that it carries stores none. c_i is the ``gravcomp`` of body
-    i, m_i its mass in kg, x_i its centre of mass in m, g gravity in m/s².
+    V_0 is MuJoCo's energy of gravity and springs, V_U that of flexes (``elastic``). Gravity
+    compensation depends on positions alone, so it stores energy, and a weight that it carries
+    stores none. c_i is the ``gravcomp`` of body i, m_i its mass in kg, x_i its centre of mass in m,
+    g gravity in m/s².
     """
     mj = s.mj
     mj_energy_pos(mj.model, mj.data)
@@ -517,7 +519,7 @@ def potential_energy(s: State) -> float:
         gravity = vector_of(floats(mj.gravity, 3))
         for body in range(mj.nbody):
             potential += masses[body] * dot(gravity, vector_of(centres[3 * body :]))
-    return float(potential)
+    return float(potential + elastic_energy(s))
 
 
 @compiled
@@ -534,6 +536,7 @@ def refresh_energies(s: State) -> None:
         return
     if not s.loop.has_positions:
         refresh_inertia(s)
+    follow_elastic(s)
     s.energy.potential = potential_energy(s)
     mj_energy_vel(mj.model, mj.data)
     s.energy.kinetic = floats(mj.energy, 2)[1]

@@ -67,6 +67,8 @@ mj_mul_m: Any = external("mj_mulM", "void(intp, intp, intp, intp)")
 mj_mul_jac: Any = external("mj_mulJacVec", "void(intp, intp, intp, intp)")
 mj_solve_m: Any = external("mj_solveM", "void(intp, intp, intp, intp, int32)")
 mj_apply_ft: Any = external("mj_applyFT", "void(intp, intp, intp, intp, intp, int32, intp)")
+mj_differentiate_pos: Any = external("mj_differentiatePos", "void(intp, intp, double, intp, intp)")
+mj_integrate_pos: Any = external("mj_integratePos", "void(intp, intp, intp, double)")
 mju_mul_mat_vec_sparse: Any = external(
     "mju_mulMatVecSparse", "void(intp, intp, intp, int32, intp, intp, intp, intp)"
 )

@@ -134,7 +134,7 @@ each a normal away from the surface, the arm from the grip to the point of the t
 and the gap there in m. ``work`` in J is all that the coupling has done on the program's tool so
 far, 0 where the program applies no wrench."""
 
-FORMAT = "12"
+FORMAT = "13"
 """Format of a recording: its fields, the request with its options, and the numbers that follow from
 it. A recording of another format is refused, so other fields in any of them need the next number.
 

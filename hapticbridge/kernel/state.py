@@ -1,4 +1,4 @@
-"""The kernel's state, bound to a model and its data: sixteen sub-records, each with one writer.
+"""The kernel's state, bound to a model and its data: seventeen sub-records, each with one writer.
 
 One structured array of one element crosses from Python into the compiled functions: unpacking one
 array costs 0.1 µs, unpacking forty would cost more than MuJoCo's step. Numba hands its sub-records
@@ -13,6 +13,7 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | pose        | poses of device, handle and tool, and their steps | handle                        |
 | loop        | results that a stage of a tick hands to the next  | tick                          |
 | energy      | storage, works of all ports, slack, verdict       | ledger                        |
+| elastic     | energy of flexes, a second model for their force  | elastic                       |
 | guard       | thresholds, ramp, fade, buttons                   | tick_guard                    |
 | observer    | energy at the device, added damping               | passivity_controller          |
 | watch       | late force, sign of the force, greatest ratio      | swing_watch                   |
@@ -51,6 +52,7 @@ from hapticbridge.kernel.codes import (
 )
 from hapticbridge.kernel.colliders import bind_colliders
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
+from hapticbridge.kernel.elastic import ELASTIC_DTYPE, bind_elastic, start_elastic
 from hapticbridge.kernel.force_level import LEVEL_DTYPE, bind_level
 from hapticbridge.kernel.handle import (
     POSE_DTYPE,
@@ -167,6 +169,7 @@ STATE_DTYPE = np.dtype(
         ("pose", POSE_DTYPE),
         ("loop", LOOP_DTYPE),
         ("energy", ENERGY_DTYPE),
+        ("elastic", ELASTIC_DTYPE),
         ("guard", GUARD_DTYPE),
         ("observer", OBSERVER_DTYPE),
         ("watch", WATCH_DTYPE),
@@ -337,6 +340,7 @@ class BoundKernel:
         discard_wrench(s["loop"])
         forget_sent(s["coupling"])
         end_pulse(s["impact"])
+        direct(start_elastic, s)(s)
         direct(refresh_energies, s)(s)
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         add_reset_work(s["energy"], after - before)
@@ -381,6 +385,7 @@ class BoundKernel:
         self._own({"grip_dofs": dofs})
         mj["has_actuators"] = model.nactuator > own or bool(np.any(model.jnt_actgravcomp))
         mj["has_belts"] = np.any(model.geom_surfacevel)
+        self._elastic = bind_elastic(self._record["elastic"], model, data)
         if parameters.scheme == Scheme.MASSLESS:
             self._own(massless_tool(model, grip))
             mj["tool_map_size"] = self._owned["tool_map"].size
@@ -446,6 +451,7 @@ class BoundKernel:
             mujoco.mj_fwdPosition(self._model, self._data)
             balance_contacts(s)
         else:
+            direct(start_elastic, s)(s)
             direct(refresh_energies, s)(s)
         start_energies(s["energy"])
         direct(credit_springs, s)(s)

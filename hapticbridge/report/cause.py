@@ -22,13 +22,20 @@ from hapticbridge.demand.certificate import DampingCondition, run_conditions
 from hapticbridge.demand.loop_setting import Lag, LoopSetting, delay_ticks, required_damping
 from hapticbridge.demand.methods import Method
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.kernel.elastic import unstored_energy
 from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.scene.checks import first_pump, unmetered_work
 from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
-from hapticbridge.scene.physics import STEADY_WAY, TendonWatch, WayJump
+from hapticbridge.scene.physics import (
+    STEADY_WAY,
+    TendonWatch,
+    WayJump,
+    firm_edges,
+    unstored_words,
+)
 from hapticbridge.theory.bounds import NEEDED_SHARE
 from hapticbridge.units import format_count, format_energy, format_number
 
@@ -43,6 +50,7 @@ Kind = Literal[
     "quantisation",
     "unmetered work",
     "jumping tendon",
+    "bottomless flex",
     "unknown",
 ]
 
@@ -257,8 +265,9 @@ def touched_pairs(
     total = float(gained.sum())
     found: defaultdict[frozenset[int], float] = defaultdict(float)
     try:
-        for data, energy in zip(_states_in(evidence, window), gained.tolist(), strict=True):
-            touching = data.contact.geom[data.contact.efc_address >= 0].tolist()
+        for run, energy in zip(_runs_in(evidence, window), gained.tolist(), strict=True):
+            contact = run.data.contact
+            touching = contact.geom[contact.efc_address >= 0].tolist()
             for pair in {frozenset(geoms) for geoms in touching}:
                 found[pair] += energy / total if total > 0 else 0.0
     except RecordingError:
@@ -266,8 +275,8 @@ def touched_pairs(
     return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 
-def _states_in(evidence: Evidence, window: slice) -> Iterator[mujoco.MjData]:
-    """Simulates a run again; yields the scene after each tick of the window.
+def _runs_in(evidence: Evidence, window: slice) -> Iterator[Resimulator]:
+    """Simulates a run again; yields it after each tick of the window.
 
     Raises:
         RecordingError: It cannot be simulated.
@@ -278,7 +287,7 @@ def _states_in(evidence: Evidence, window: slice) -> Iterator[mujoco.MjData]:
         run.add(ticks[begin : min(begin + BLOCK, window.start)])
     for tick in range(window.start, window.stop):
         run.add(ticks[tick : tick + 1])
-        yield run.data
+        yield run
 
 
 # Causes of energy created in the environment
@@ -309,6 +318,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
             "move them slower",
         )
     own = _cause_of_scene(evidence, report, where)
+    own = own or _flex_cause(evidence, report, window, gained)
     if cause := own or _jump_cause(evidence, report, window, gained):
         return cause
     if share < MOST:
@@ -354,8 +364,8 @@ def _jump_cause(
     at_jump, largest = np.zeros((model.ntendon, gained.size)), dict[int, WayJump]()
     watch = TendonWatch(model)
     try:
-        for tick, data in enumerate(_states_in(evidence, window)):
-            for tendon, jump in watch.jumps(data).items():
+        for tick, run in enumerate(_runs_in(evidence, window)):
+            for tendon, jump in watch.jumps(run.data).items():
                 at_jump[tendon, max(tick - 1, 0) : tick + 2] = 1.0  # lengths of a step lag by one
                 largest[tendon] = max(largest.get(tendon, jump), jump)
     except RecordingError:
@@ -371,6 +381,25 @@ def _jump_cause(
         f"tendon '{name}' jumped, by up to {jump.size} in one tick: its way round a geom changed",
         f"write {STEADY_WAY}",
     )
+
+
+def _flex_cause(
+    evidence: Evidence, report: AuditReport, window: slice, gained: NDArray[np.float64]
+) -> Cause | None:
+    """Returns a flex as the cause, if most of the energy is what it gave without storing it."""
+    model = evidence.model
+    if model is None or not model.nflex:
+        return None
+    if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
+        return None
+    try:
+        given = [unstored_energy(run.binding.state[0]) for run in _runs_in(evidence, window)]
+    except RecordingError:
+        return None
+    if given[-1] <= MOST * float(gained.sum()):
+        return None
+    step = evidence.parameters.period / evidence.parameters.substeps
+    return Cause("bottomless flex", unstored_words(model, given[-1]), firm_edges(step))
 
 
 def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cause:

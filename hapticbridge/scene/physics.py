@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.kernel.codes import held_body
-from hapticbridge.scene.contacts import impedance_at
-from hapticbridge.units import format_si
+from hapticbridge.scene.contacts import REFERENCE_STEPS, impedance_at
+from hapticbridge.units import format_energy, format_si
 
 # Poses and rotations as NumPy arrays, by MuJoCo's functions
 
@@ -236,6 +236,25 @@ STEADY_WAY = (
     'a sidesite="…" at the geom that it wraps, or a geom that it never leaves or never meets'
 )
 """Change that keeps a tendon from jumping."""
+
+
+def unstored_words(model: mujoco.MjModel, energy: float) -> str:
+    """Returns a clause on energy in J that the flexes gave without having stored it."""
+    bent = np.flatnonzero(model.flex_bendingadr >= 0).tolist() or range(model.nflex)
+    kind = mujoco.mjtObj.mjOBJ_FLEX
+    names = ", ".join(f"'{mujoco.mj_id2name(model, kind, flex) or flex}'" for flex in bent)
+    return (
+        f"the elasticity of flex {names} gave {format_energy(energy)} that it never stored: once "
+        "its edges give way, bending has no least energy"
+    )
+
+
+def firm_edges(step: float) -> str:
+    """Returns the change that keeps a flex from that; ``step`` is the scene's time step in s."""
+    return (
+        f'write <edge equality="true" solref="{REFERENCE_STEPS * step:g} 1"> for it, which holds '
+        'its edges more firmly, or elastic2d="both" without an equality of its edges'
+    )
 
 
 class WayJump(NamedTuple):

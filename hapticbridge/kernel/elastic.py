@@ -1,0 +1,140 @@
+"""Elastic energy of flexes, which MuJoCo's own potential energy lacks.
+
+    U(q) = −∫ Q·dq,    V_U = max(U, 0)
+
+Q is the generalised force of the flexes' elasticity at rest, from a second model without any other
+spring; q are the positions, from those of the model, where U = 0. U in J depends on the end of the
+way alone, so the way of a tick is straight, and two points of Gauss's quadrature take its integral:
+it is exact where Q is a cubic polynomial, as for stretched elements whose vertices slide.
+
+What a flex gives below U = 0 it never stored. The bending of a curved flex is such a force: its
+energy has no lower bound once the edges give way. It counts as created.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import mujoco
+import numpy as np
+
+from hapticbridge.kernel.codes import Part, State
+from hapticbridge.kernel.jit import compiled
+from hapticbridge.kernel.mujoco_c import (
+    addresses,
+    floats,
+    mj_differentiate_pos,
+    mj_fwd_kinematics,
+    mj_integrate_pos,
+    mj_passive,
+)
+
+ELASTIC_DTYPE = np.dtype(
+    [
+        ("model", "<i8"),
+        ("data", "<i8"),
+        ("rest", "<i8"),
+        ("last", "<i8"),
+        ("way", "<i8"),
+        ("trial", "<i8"),
+        ("force", "<i8"),
+        ("plastic", "<i8"),
+        ("own_plastic", "<i8"),
+        ("nplastic", "<i8"),
+        ("energy", "<f8"),
+    ]
+)
+"""Sub-record ``elastic``: U in J, and addresses: the second model and its data, its positions, its
+elastic force, the model's positions, those up to which U is known, the way from there, and the
+state of twisted rods (MuJoCo's ``plastic``) of both. ``model`` is 0 without an elastic flex."""
+
+_GAUSS = (0.5 - 0.5 / 3.0**0.5, 0.5 + 0.5 / 3.0**0.5)
+
+PARTS = 16
+"""Parts of the way from the model's positions to those of a start. That of a tick is one part."""
+
+
+def has_elastic_flex(model: mujoco.MjModel) -> bool:
+    """Returns True if the elasticity of a flex does work."""
+    is_off = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SPRING
+    return not is_off and bool(np.any(model.flex_stiffness) or np.any(model.flex_bending))
+
+
+def bind_elastic(elastic: Part, model: mujoco.MjModel, data: mujoco.MjData) -> tuple[object, ...]:
+    """Writes the addresses, if a flex is elastic; returns what must outlive the state."""
+    if not has_elastic_flex(model):
+        return ()
+    alone = copy.copy(model)
+    for springs in (alone.jnt_stiffness, alone.tendon_stiffness):
+        springs[:] = 0.0
+    for springs in (alone.jnt_stiffnesspoly, alone.tendon_stiffnesspoly):
+        springs[:] = 0.0
+    trial = mujoco.MjData(alone)
+    arrays = {
+        "rest": alone.qpos0,
+        "last": np.zeros(model.nq),
+        "way": np.zeros(model.nv),
+        "trial": trial.qpos,
+        "force": trial.qfrc_spring,
+        "plastic": trial.plastic,
+        "own_plastic": data.plastic,
+    }
+    elastic["model"], elastic["data"] = addresses(alone, trial)
+    for name, array in arrays.items():
+        elastic[name] = array.ctypes.data
+    elastic["nplastic"] = model.nplastic
+    return alone, trial, arrays
+
+
+@compiled
+def start_elastic(s: State) -> None:
+    """Computes U at the present positions, without a way from others."""
+    if s.elastic.model:
+        _copy(s.elastic.rest, s.elastic.last, s.mj.nq)
+        s.elastic.energy = 0.0
+        _add_way(s, PARTS)
+
+
+@compiled
+def follow_elastic(s: State) -> None:
+    """Adds to U what the way to the present positions did, which must be short."""
+    if s.elastic.model:
+        _add_way(s, 1)
+
+
+@compiled
+def elastic_energy(s: State) -> float:
+    """Returns V_U in J, the part of U that was stored."""
+    return float(max(s.elastic.energy, 0.0))
+
+
+def unstored_energy(s: State) -> float:
+    """Returns the energy in J that the flexes gave without having stored it, max(−U, 0)."""
+    return max(-float(s["elastic"]["energy"]), 0.0)
+
+
+@compiled
+def _add_way(s: State, parts: int) -> None:
+    """Adds −∫ Q·dq to U, from the positions up to which it is known to the present ones."""
+    mj, elastic = s.mj, s.elastic
+    _copy(elastic.own_plastic, elastic.plastic, elastic.nplastic)
+    mj_differentiate_pos(mj.model, elastic.way, 1.0, elastic.last, mj.qpos)
+    way, force = floats(elastic.way, mj.nv), floats(elastic.force, mj.nv)
+    work = 0.0
+    for part in range(parts):
+        for share in _GAUSS:
+            _copy(elastic.last, elastic.trial, mj.nq)
+            mj_integrate_pos(mj.model, elastic.trial, elastic.way, (part + share) / parts)
+            mj_fwd_kinematics(elastic.model, elastic.data)
+            mj_passive(elastic.model, elastic.data)
+            for i in range(mj.nv):
+                work += force[i] * way[i]
+    elastic.energy -= 0.5 * work / parts
+    _copy(mj.qpos, elastic.last, mj.nq)
+
+
+@compiled
+def _copy(source: int, target: int, count: int) -> None:
+    values, copied = floats(source, count), floats(target, count)
+    for i in range(count):
+        copied[i] = values[i]
