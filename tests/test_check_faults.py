@@ -678,12 +678,13 @@ def test_a_tool_whose_inertia_is_refused_has_no_centre_that_the_grip_is_far_from
     ("joints", "is_told"),
     [
         ("<freejoint/>", True),
-        ("<joint axis='1 0 0'/>", True),
+        ("<joint axis='1 0 0'/>", False),
+        ("<joint type='slide' axis='0 1 0'/><joint axis='1 0 0'/>", True),
         ("<joint type='slide'/>", False),
         ("<joint type='slide' axis='1 0 0'/><joint axis='0 0 1' pos='0 0 0.2'/>", False),
     ],
 )
-def test_a_far_grip_is_told_only_of_a_tool_that_pushes_turn(
+def test_a_far_grip_is_told_only_of_a_tool_that_pushes_turn_and_no_hinge_holds(
     joints: str, is_told: bool, tmp_path: Path
 ) -> None:
     body = f"""<body name="tool" pos="0 0.7 0">{joints}

@@ -43,7 +43,7 @@ def test_the_filters_are_set_and_said() -> None:
     bench.opened(force_gate=0.1)
     assert (inverse.gate_gain, inverse.damping) == (0.1, 0.0)
     assert bench.service.profile == "hapticbridge"
-    (said,) = bench.told
+    said = bench.told[0]
     assert "force_gate.gain set to 0.1, damping.scalar to 0 (force_gate.gain was 0.3" in said
     assert "damping.scalar was 5" in said
     assert "oscillation damper cannot be switched off" in said
@@ -109,6 +109,27 @@ def test_a_versegrip_turns_the_tool_and_has_buttons() -> None:
     bench.service.orientation = grip(2.0, 0.0, 0.0, 0.0)
     with pytest.raises(DeviceError, match="reports no orientation of the VerseGrip"):
         ticks(device, bench.time, 5, FORCE)
+
+
+def test_a_versegrip_that_is_gone_ends_the_run() -> None:
+    bench = HaplyBench()
+    bench.service.orientation = grip(0.6, 0.8, 0.0, 0.0)
+    device = bench.opened()
+    device.start(PERIOD)
+    ticks(device, bench.time, 5, FORCE)
+    bench.service.grip = ""
+    with pytest.raises(DeviceLost, match="the VerseGrip is gone: the Inverse Service does not"):
+        ticks(device, bench.time, 5, FORCE)
+
+
+def test_a_versegrip_that_sleeps_at_the_start_is_told() -> None:
+    bench = HaplyBench()
+    device = bench.opened()
+    assert device.info.sensed == ()
+    assert "has sent no orientation yet; move it, and start again" in bench.told[1]
+    bench.service.grip = ""
+    bench.opened()
+    assert len(bench.told) == 3  # without a grip nothing is said of it
 
 
 def test_a_wired_grip_has_one_button_and_turns_too() -> None:

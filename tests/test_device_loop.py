@@ -134,6 +134,25 @@ def test_a_wrench_at_the_pose_of_the_step_before_is_told(is_renewed: bool) -> No
     assert device.summary["verdict"] == "passive"
 
 
+def test_a_wrench_along_the_tools_axes_is_told_with_its_cause() -> None:
+    model = mujoco.MjModel.from_xml_string(BALL.replace("<body", '<body quat="1 0 0 1"'))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    tip = data.site("tip").xpos
+    with (
+        DeviceLoop("simulated", is_simulated=True, scene_rate=500.0) as device,
+        pytest.warns(UserWarning, match="the wrench may act along other axes, with another sign"),
+    ):
+        device.show(tip)
+        for _ in range(1000):
+            force = device.wrench(tip, data.qvel[:3])[:3]
+            data.xfrc_applied[1, :3] = data.xmat[1].reshape(3, 3).T @ force
+            mujoco.mj_step(model, data)
+            mujoco.mj_kinematics(model, data)
+            device.advance(model.opt.timestep)
+    assert device.summary["verdict"] == "passive"
+
+
 def test_a_handle_is_put_where_the_tool_is_put() -> None:
     with DeviceLoop("simulated", is_simulated=True) as device:
         followed(device, 1.0)

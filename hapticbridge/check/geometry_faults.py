@@ -126,11 +126,16 @@ def grip_faults(case: SceneUnderCheck) -> Iterator[Fault]:
 
 
 def _is_turned_by_pushes(model: mujoco.MjModel, data: mujoco.MjData, site: int) -> bool:
-    """Returns True if a force of 1 N at a site gives its body an angular acceleration."""
+    """Returns True if a force of 1 N at a site turns a body that could move without turning.
+
+    A body that cannot, such as a lever, turns about its hinges and not about a point in the air.
+    """
     moved, turned, pushed = np.zeros((3, 3, model.nv))
     mujoco.mj_jacSite(model, data, moved, turned, site)
     mujoco.mj_solveM(model, data, pushed, moved)
-    return bool(np.abs(pushed @ turned.T).max() > _NO_TURN)
+    rank = np.linalg.matrix_rank
+    is_lever = rank(np.vstack([moved, turned])) == rank(turned)
+    return not is_lever and bool(np.abs(pushed @ turned.T).max() > _NO_TURN)
 
 
 def workspace_faults(case: SceneUnderCheck) -> Iterator[Fault]:

@@ -2,7 +2,8 @@
 
 A VerseGrip that is paired adds its buttons and its orientation. It has no motors, so its three
 rotations are ``sensed``: the tool turns with it, and the hand does not feel the torque. The option
-``turn=0`` leaves them out. A grip that falls silent keeps its last orientation.
+``turn=0`` leaves them out. A grip that is listed and sends no orientation keeps its last one; one
+that is not listed any more is a lost device.
 
 The service answers each message with the device's state when the message arrived. So each tick
 sends a force, and its answer is read in the next tick. As with the Falcon, one message carries the
@@ -116,11 +117,13 @@ class State:
         buttons: Bit 0 is a, bit 1 b, bit 2 c.
         orientation: Unit quaternion of the VerseGrip in the frame of the position; None without a
             grip, or before it has sent one.
+        has_grip: True if a VerseGrip is listed.
     """
 
     position: tuple[float, float, float]
     buttons: int
     orientation: Quaternion | None = None
+    has_grip: bool = False
 
 
 def inventory(message: str) -> list[Listed]:
@@ -144,8 +147,9 @@ def state_of(message: str, device_id: str) -> State:
             grip = _grip(content)
             return State(
                 _vector(_part(entry, "state"), "cursor_position"),
-                _buttons(grip),
-                _orientation(grip),
+                _buttons(grip or {}),
+                _orientation(grip or {}),
+                has_grip=grip is not None,
             )
     raise DeviceLost(f"the device '{device_id}' is gone: {SERVICE} does not list it any more")
 
@@ -250,13 +254,13 @@ def _vector(where: dict[str, Any], key: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _grip(content: dict[str, Any]) -> dict[str, Any]:
-    """Returns the state of the first VerseGrip; empty without one."""
+def _grip(content: dict[str, Any]) -> dict[str, Any] | None:
+    """Returns the state of the first VerseGrip; None if none is listed."""
     for name in GRIPS:
         entries = content.get(name)
         if isinstance(entries, list) and entries and isinstance(entries[0], dict):
             return _part(entries[0], "state")
-    return {}
+    return None
 
 
 def _buttons(grip: dict[str, Any]) -> int:
@@ -398,14 +402,17 @@ class HaplyDevice:
             refuse_scaled(listed)
             notify(describe_filters(listed, force_gate))
             first = self._exchange(first_message(listed, force_gate))
-            grip = state_of(first, listed.device_id).orientation
-            self._turns = turns and grip is not None
-            if grip is not None:
+            state = state_of(first, listed.device_id)
+            self._turns = turns and state.orientation is not None
+            if self._turns:
+                notify("the VerseGrip turns the tool without torque on the hand")
+            elif state.has_grip and turns:
                 notify(
-                    "the VerseGrip turns the tool without torque on the hand"
-                    if turns
-                    else "the VerseGrip does not turn the tool"
+                    "the VerseGrip does not turn the tool, because it has sent no orientation yet; "
+                    "move it, and start again"
                 )
+            elif state.has_grip:
+                notify("the VerseGrip does not turn the tool")
             rate, delay = measured_timing(link, force_message(listed, (0.0, 0.0, 0.0)), self._name)
             self.info = DeviceInfo(
                 name=listed.kind,
@@ -526,6 +533,11 @@ class HaplyDevice:
         state = state_of(message, self._listed.device_id)
         self._sample["position"] = state.position
         self._sample["buttons"] = state.buttons
+        if self._turns and not state.has_grip:
+            raise DeviceLost(
+                f"the VerseGrip is gone: {SERVICE} does not list it any more; pair it again, or "
+                "use the option turn=0"
+            )
         if self._turns and state.orientation is not None:
             self._sample["quaternion"] = state.orientation
 

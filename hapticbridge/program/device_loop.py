@@ -53,7 +53,9 @@ DOUBTFUL = 0.5
 UNPAID = (
     f"the wrench has moved the tool by {DOUBTFUL:g} J that the hand did not give: the tool's pose "
     "may be a step old (in MuJoCo, call mj_kinematics before wrench()), its steps not in time with "
-    "the clock, or too long for so light a tool"
+    "the clock, or too long for so light a tool; the wrench may act along other axes, with another "
+    "sign, or at another point than the shown one; or the tool was put elsewhere without "
+    "show(pose, is_placed=True)"
 )
 
 LONGEST_ADVANCE = 1e4
