@@ -330,6 +330,17 @@ def test_the_scene_is_the_cause_by_what_touched_and_what_was_moved(made: Made) -
     assert cause_of(recording, report, events=still).kind == "contact setting"
 
 
+def test_a_solver_at_its_limit_is_the_cause_of_what_came_in_those_ticks(made: Made) -> None:
+    recording, report = made(report_runs.active_by_contact)
+    for iterations, kind in ((99, "contact setting"), (100, "solver")):
+        ticks = recording.ticks.copy()
+        ticks["solver_iterations"] = iterations
+        cause = cause_of(recording, report, ticks=ticks)
+        assert cause.kind == kind
+    assert "limit of 100 iterations" in cause.evidence
+    assert cause.remedy == 'write <option iterations="1000">'
+
+
 def test_a_joint_that_pumps_is_named_as_the_cause(tmp_path: Path) -> None:
     path, scene = tmp_path / "run.mcap", tmp_path / "drawer.xml"
     scene.write_text(

@@ -13,12 +13,8 @@ from hapticbridge.scene.checks import unmetered_work
 from hapticbridge.scene.contacts import suggested_solref
 from hapticbridge.scene.fault import Fault, number
 from hapticbridge.scene.physics import STEADY_WAY
+from hapticbridge.scene.scene import iteration_limit
 from hapticbridge.units import format_count
-
-ITERATIONS = 100
-"""MuJoCo's default limit of solver iterations. Newton's solver takes 1 to 8 in the shipped
-scenes."""
-
 
 FULL_TICKS = 1e-3
 """Share of a motion's ticks above which a solver at its limit is told, without unit. A hard blow
@@ -43,15 +39,15 @@ def run_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         )
         return
     if seen.full_ticks > FULL_TICKS * case.samples.size:
-        limit = int(case.model.opt.iterations)
-        if case.is_rigid:  # which raises a lower limit to MuJoCo's
-            limit = max(limit, ITERATIONS)
+        limit, usual = (
+            iteration_limit(case.model, is_rigid=each) for each in (case.is_rigid, True)
+        )
         yield Fault(
             "solver iterations",
             option("iterations"),
             f"the solver stopped at its limit of {limit} iterations in {seen.full_ticks} of "
             f"{case.samples.size} ticks: contact forces are not what they should be",
-            case.places.option_change("iterations", f"{max(ITERATIONS, 2 * limit)}"),
+            case.places.option_change("iterations", f"{max(usual, 2 * limit)}"),
         )
     for words, count in seen.warnings.items():
         yield Fault(

@@ -36,6 +36,7 @@ from hapticbridge.scene.physics import (
     firm_edges,
     unstored_words,
 )
+from hapticbridge.scene.scene import iteration_limit
 from hapticbridge.theory.bounds import NEEDED_SHARE
 from hapticbridge.units import format_count, format_energy, format_number
 
@@ -51,6 +52,7 @@ Kind = Literal[
     "unmetered work",
     "jumping tendon",
     "bottomless flex",
+    "solver",
     "unknown",
 ]
 
@@ -318,6 +320,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
             "move them slower",
         )
     own = _cause_of_scene(evidence, report, where)
+    own = own or _solver_cause(evidence, window, gained)
     own = own or _flex_cause(evidence, report, window, gained)
     if cause := own or _jump_cause(evidence, report, window, gained):
         return cause
@@ -380,6 +383,25 @@ def _jump_cause(
         f"{shares[tendon]:.0%} of the energy created until then came as the {jump.quantity} of "
         f"tendon '{name}' jumped, by up to {jump.size} in one tick: its way round a geom changed",
         f"write {STEADY_WAY}",
+    )
+
+
+def _solver_cause(evidence: Evidence, window: slice, gained: NDArray[np.float64]) -> Cause | None:
+    """Returns the solver as the cause, if most of the energy came where it did not finish."""
+    model, total = evidence.model, float(gained.sum())
+    if model is None or total <= 0.0:
+        return None
+    limit = iteration_limit(model, is_rigid=evidence.parameters.is_rigid)
+    unfinished = evidence.ticks["solver_iterations"][window] >= limit
+    share = float(gained[unfinished].sum()) / total
+    if share < MOST:
+        return None
+    return Cause(
+        "solver",
+        f"{share:.0%} of the energy created until then came in ticks in which MuJoCo's solver "
+        f"stopped at its limit of {limit} iterations: its forces are not those of the contacts "
+        "and constraints",
+        f'write <option iterations="{10 * limit}">',
     )
 
 

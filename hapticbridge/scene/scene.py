@@ -66,6 +66,11 @@ def _place(change: SceneChange) -> int:
     return _OF_RUN.index(change.subject)
 
 
+def iteration_limit(model: mujoco.MjModel, *, is_rigid: bool) -> int:
+    """Returns the number of iterations at which the solver of a file's model stops in a run."""
+    return max(int(model.opt.iterations), int(_PRECISE["iterations"]) if is_rigid else 0)
+
+
 def _rigid_options(option: mujoco.MjOption) -> dict[str, Any]:
     """Returns the values of options that rigid contacts need."""
     return {
