@@ -471,6 +471,15 @@ def test_a_split_bag_is_told_with_what_joins_it(tmp_path: Path) -> None:
     for place in (folder, f"{folder}:/hand"):
         with pytest.raises(DeviceError, match="or let 'ros2 bag convert' write the whole bag into"):
             open_device(f"trajectory:{place}")
+    (folder / "walk_1.mcap").unlink()
+    listed = (folder / "metadata.yaml").read_text()
+    assert listed.count(f"- {file.name}\n") == 1
+    split = listed.replace(f"- {file.name}\n", f"- {file.name}\n  - walk_1.mcap\n")
+    (folder / "metadata.yaml").write_text(split)
+    for place in (folder, f"{folder}:/hand"):
+        with pytest.raises(DeviceError, match=f"2 files, and only .* '{file.name}' itself to take"):
+            open_device(f"trajectory:{place}")
+    assert open_device(f"trajectory:{file}").info.duration == pytest.approx(0.04, abs=1e-12)
 
 
 def test_a_damaged_recording_is_no_motion_and_a_cut_one_says_so(tmp_path: Path) -> None:

@@ -103,6 +103,9 @@ def test_a_wrong_axis_is_refused_before_the_force(
     recording = hb.read_recording(path)
     assert len(recording.ticks) == 0
     assert [e["event"] for e in recording.events][-3:] == ["probe", "trip", "stop"]
+    assert f"it holds no tick; the guard tripped at tick 0: a small force {words}" in (
+        audit(path).sentence
+    )
 
 
 def test_a_wrong_axis_behind_a_soft_coupling_gives_next_to_nothing() -> None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import warnings
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
@@ -294,9 +295,20 @@ def test_names_that_lead_out_of_a_folder_are_recorded_as_names_in_it(
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
 
 
-def test_a_run_whose_recording_could_not_be_audited_says_so_at_its_start(tmp_path: Path) -> None:
+def _heavier(model: mujoco.MjModel) -> None:
+    model.body("tool").mass = 0.2
+
+
+def _with_other_friction(model: mujoco.MjModel) -> None:
+    model.opt.impratio = 3.0  # replaced by the run, and recorded as a change to the file
+
+
+@pytest.mark.parametrize("change", [_heavier, _with_other_friction])
+def test_a_run_whose_recording_could_not_be_audited_says_so_at_its_start(
+    tmp_path: Path, change: Callable[[mujoco.MjModel], None]
+) -> None:
     scene = load_scene(scene_file(tmp_path, mjcf()))
-    scene.model.body("tool").mass = 0.2
+    change(scene.model)
     with pytest.warns(UserWarning, match="the recording could not be audited: "):
         recorded(tmp_path / "run.mcap", scene, duration=0.1)
     assert audit(tmp_path / "run.mcap").verdict == "invalid"

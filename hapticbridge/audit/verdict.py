@@ -507,7 +507,9 @@ def verdict_on(
         gap = "MuJoCo could not simulate the scene to the end; until then"
     report = decide_on_hands(report, fault, energies, gap=gap, strict=strict)
     if report.verdict == "invalid":
-        return replace(report, certification=None)
+        end = "" if recording.count else unusual_end(report.trip, ())
+        sentence = "; ".join(filter(None, (report.sentence, end)))
+        return replace(report, sentence=sentence, certification=None)
     if report.obstacle:
         report = replace(report, unchecked=report.unchecked or _UNCHECKED_WITHOUT_REPLAY)
     return replace(report, remarks=tuple(filter(None, _remarks(report, recording.events))))

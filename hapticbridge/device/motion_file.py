@@ -11,6 +11,7 @@ import stat
 import struct
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -46,6 +47,7 @@ def motion_in(text: str) -> Motion | Path:
         DeviceError: There is none, or it is damaged.
     """
     path, topic = _named_topic(text)
+    _refuse_part(text, path)
     if not _is_recording(path):
         _refuse_other_bag(path)
         if topic:
@@ -64,6 +66,25 @@ def _named_topic(text: str) -> tuple[Path, str]:
     except (OSError, ValueError):  # reading it as a motion then reports the reason
         return Path(text), ""
     return bags[0] if len(bags) == 1 else path, f"/{topic}" if is_named else ""
+
+
+def _refuse_part(text: str, path: Path) -> None:
+    """Refuses the one file that is left of a split bag, if its folder was named.
+
+    Raises:
+        DeviceError: It is one.
+    """
+    folder = path.parent
+    if path.suffix != ".mcap" or Path(text.partition(":/")[0]) != folder:
+        return
+    with suppress(OSError, UnicodeDecodeError):
+        described = (folder / "metadata.yaml").read_text(encoding="utf-8")
+        listed = set(re.findall(r"^\s*-\s+(\S+\.mcap)\b", described, re.MULTILINE))
+        if len(listed) > 1:
+            raise DeviceError(
+                f"{folder}: its metadata.yaml names {len(listed)} files, and only one is there; "
+                f"name '{path.name}' itself to take it alone"
+            )
 
 
 def _refuse_other_bag(path: Path) -> None:

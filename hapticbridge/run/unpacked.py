@@ -112,6 +112,11 @@ def load_unpacked(main: Path, request: RunRequest, *, is_carried: bool) -> Scene
     return scene
 
 
+def _determined(scene: Scene) -> tuple[str, list[str]]:
+    """Returns the digest of the model, and the changes to its file that no run has a reason for."""
+    return model_digest(scene.model), [str(each) for each in scene.differences if not each.reason]
+
+
 def warn_of_other_scene(
     scene: Scene, request: RunRequest, recording: Path, prepare: Callable[[Scene], object]
 ) -> None:
@@ -134,7 +139,7 @@ def warn_of_other_scene(
             main = unpack_scene(recording, files, Path(folder))
             again = load_unpacked(main, request, is_carried=scene.is_carried)
             prepare(again)
-            is_equal = model_digest(again.model) == model_digest(scene.model)
+            is_equal = _determined(again) == _determined(scene)
         reason = "its files compile to another model; was it changed after it was loaded?"
         concern = "" if is_equal else f"the recording could not be audited: {reason}"
         if is_equal and (size := scene.model.nbuffer) > LARGE:

@@ -114,7 +114,7 @@ class Scene:
         path: The MJCF file.
         grip: Name of the site on the tool.
         model: MuJoCo's model, with the bridge's handle and coupling.
-        data: State of the model.
+        data: State of the model. A run begins at the start, whatever was written here.
         sources: The original bytes of the file, its includes and its assets.
         parameters: Value of each of the scene's parameters, in the unit of its parameter file.
         differences: What differs from the file.
