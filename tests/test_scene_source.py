@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from outside_scenes import RICH, mjcf, obj_bytes, png_bytes, scene_file, stl_bytes
 
 from hapticbridge.audit import audit
-from hapticbridge.errors import SceneError
+from hapticbridge.errors import SceneError, SceneWarning
 from hapticbridge.run.description import model_digest
 from hapticbridge.scene import load_scene
 from hapticbridge.scene.load import plain_model, read_scene
@@ -312,6 +312,18 @@ def test_a_run_whose_recording_could_not_be_audited_says_so_at_its_start(
     with pytest.warns(UserWarning, match="the recording could not be audited: "):
         recorded(tmp_path / "run.mcap", scene, duration=0.1)
     assert audit(tmp_path / "run.mcap").verdict == "invalid"
+
+
+def test_a_state_that_a_run_leaves_for_its_start_is_told(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, mjcf()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        recorded(tmp_path / "run.mcap", scene, duration=0.1)
+        recorded(tmp_path / "again.mcap", scene, duration=0.1)
+    scene.reset()
+    scene.data.qpos[2] += 0.01
+    with pytest.warns(SceneWarning, match=r"data.qpos is not that of .*'home'"):
+        recorded(tmp_path / "moved.mcap", scene, duration=0.1)
 
 
 @pytest.mark.parametrize("most", [1e6, 1e8])

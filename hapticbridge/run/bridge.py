@@ -140,6 +140,8 @@ class Bridge:
                 f"{self.clock.__name__}()"
             )
         self.device: Device
+        if isinstance(scene, Scene):
+            scene.tell_written_state()
         if isinstance(device, Sequence) and not isinstance(device, str):
             setups = self._resolve_hands(scene, device, coupling, options)
         else:

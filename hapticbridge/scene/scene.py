@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import SceneError, choices
+from hapticbridge.errors import SceneError, SceneWarning, choices
 from hapticbridge.kernel.codes import (
     HANDLE,
     WARNINGS,
@@ -213,6 +214,25 @@ class Scene:
         code = warning_of(self.data)
         if code in WARNINGS:
             raise SceneError(f"at the start of scene '{self.name}' {warning_words(code)}")
+
+    def tell_written_state(self) -> None:
+        """Warns that a run begins at the start, if another state was written into the data.
+
+        A scene that was stepped, as by an earlier run, is none of these.
+        """
+        start = mujoco.MjData(self.model)
+        go_to_start(self.model, start, self.grip)
+        written = [
+            name
+            for name in ("qpos", "qvel", "act", "ctrl")
+            if not np.array_equal(getattr(start, name), getattr(self.data, name))
+        ]
+        if written and self.data.time == start.time:
+            words = (
+                f"data.{written[0]} is not that of the scene's start, where a run begins; write it "
+                "into keyframe 'home' of the scene"
+            )
+            warnings.warn(SceneWarning(self.path, words), stacklevel=3)
 
     def grip_pose(self) -> tuple[float, ...]:
         """Returns the grip's pose (x, y, z, qw, qx, qy, qz) in the world frame, positions in m.
