@@ -459,3 +459,35 @@ def test_the_last_parts_that_start_elsewhere_are_counted(
     changes = load_scene(tmp_path / "doors.xml").changes
     assert sum("0 deg → 20 deg" in change for change in changes) == 4
     assert f"start of {words} the scene: as these" in changes[-1]
+
+
+KEYS = '<keyframe><key {}qpos="0 0 2 1 0 0 0 .5"/>{}</keyframe>'
+SERVO = '<actuator><position joint="elbow" kp="5"/></actuator>'
+
+
+@pytest.mark.parametrize(
+    ("name", "other", "is_start"),
+    [
+        ("", "", True),
+        ('name="home" ', "", True),
+        ('name="home" ', "<key/>", True),
+        ('name="up" ', "", False),
+        ("", "<key/>", False),
+        ('qvel="0 0 1 0 0 0 0" ', "", False),
+    ],
+)
+def test_the_only_keyframe_at_rest_is_the_start_if_it_has_no_name(
+    tmp_path: Path, name: str, other: str, is_start: bool
+) -> None:
+    keys = KEYS.format(name, other)
+    path = scene_file(tmp_path, scene_text(ARM.format("elbow", 0, ""), SERVO + keys))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        case = case_of(path)
+    scene = case.scene
+    scene.reset()
+    assert scene.data.qpos[2] == pytest.approx(2.0 if is_start else 0.1)
+    assert scene.data.ctrl[0] == pytest.approx(0.5 if is_start else 0.0)  # the servo holds it
+    said = "start: MuJoCo's initial pose → the only keyframe" in scene.changes
+    assert said is (is_start and not name)
+    assert any(fault.kind == "keyframe" for fault in find_faults(case)) == (not is_start)

@@ -201,8 +201,12 @@ TREATMENTS: dict[str, Treatment] = {
         "key", "qpos", "changed", "moved onto limits, equality constraints and contacts",
         "rigid ones would hold the violation",
     ),
+    "only keyframe": Treatment(
+        "key", "name", "changed", "the start, if it is the only one, at rest and has no name",
+        "the file names no other start",
+    ),
     "servos": Treatment(
-        "key", "ctrl", "changed", "the pose of `home` where position servos have no control",
+        "key", "ctrl", "changed", "the pose of the keyframe where position servos have no control",
         "zeros would fling the scene out of its pose",
     ),
 }  # fmt: skip
