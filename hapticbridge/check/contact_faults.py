@@ -327,7 +327,10 @@ def start_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         mover = second if model.body_treeid[model.geom_bodyid[second]] >= 0 else first
         body = int(model.geom_bodyid[mover])
         out = -contact.dist * contact.frame[:3] * (1 if mover == second else -1)
-        effect = "they are held there, and eased out with energy that the scene has dissipated"
+        effect = (
+            "they are held there, and eased out as far as joints and the energy that the scene has "
+            "dissipated allow"
+        )
         if not case.is_rigid:
             effect = (
                 f"more than {length(MAXIMUM_START_PENETRATION)} release energy that is not metered"

@@ -194,7 +194,8 @@ TREATMENTS: dict[str, Treatment] = {
         "such a contact only jams the joint",
     ),
     "overlap": Treatment(
-        "key", "", "changed", "overlaps that cannot be moved apart are eased out",
+        "key", "", "changed",
+        "overlaps that cannot be moved apart are held, and eased out as far as joints allow",
         "pushing out at once would create energy",
     ),
     "start": Treatment(
