@@ -179,6 +179,21 @@ def test_robomimic_has_its_groups(runs: list[Path], tmp_path: Path) -> None:
             assert demo["dones"][:-1].sum() == 0
 
 
+def test_robomimic_gets_the_names_of_all_scenes(tmp_path: Path) -> None:
+    """As of three episodes in two scenes of one build; robomimic reads one name for all."""
+    values = dict.fromkeys(("action", "observation.state"), np.zeros((5, 13), np.float32))
+    writer = RobomimicWriter(tmp_path, Shot(), "push")
+    scenes = ["light", "heavy", "light"]
+    for number, scene in enumerate(scenes):
+        writer.add(Episode(f"{number}.mcap", scene, values, {}, np.zeros((5, 2)), ()))
+    writer.finish()
+    writer.close()
+    with h5py.File(tmp_path / "demos.hdf5") as file:
+        about = json.loads(file["data"].attrs["env_args"])
+        assert about == {"env_name": "light, heavy", "type": 2, "env_kwargs": {"fps": 30}}
+        assert [file[f"data/demo_{i}"].attrs["scene"] for i in range(3)] == scenes
+
+
 def test_an_episode_that_the_guard_ended_is_told(call: Called, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     code, _, _ = call("run", "point_mass", "--fast", "--stretch-limit", 1e-6, "--record", path)

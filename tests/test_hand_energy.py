@@ -202,6 +202,19 @@ def test_the_sentence_names_what_the_scene_released_and_what_nothing_paid() -> N
     )
 
 
+def test_springs_that_paid_do_not_hide_the_motors_that_may_have_loaded_them() -> None:
+    """As of two arms whose servos push them into each other: 73 mJ in springs, 222 J by servos."""
+    springs = "the coupling's springs held 72.9 mJ at the start or after resets"
+    energy = HandEnergy(net=0.038, gross=0.038, springs=0.0729)
+    assert energy.sentence.endswith(springs)
+    pushed = replace(energy, motors=222.0, inputs=0.5 * INSTANT)
+    loaded = ", and the scene's motors, which may have loaded them, gave or took up to 222 J"
+    assert pushed.sentence.endswith(springs + loaded)
+    assert not pushed.limit  # the springs paid
+    unpaid = replace(pushed, net=0.1, gross=0.1)
+    assert unpaid.sentence.endswith(springs) and unpaid.limit
+
+
 def test_created_energy_that_stays_in_the_scene_is_not_at_the_hand(tmp_path: Path) -> None:
     summary, report = ran(tmp_path, PUMP, duration=2.0, controller="off")
     created = summary.energies["environment_energy"]

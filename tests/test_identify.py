@@ -449,6 +449,20 @@ def test_what_hardly_moves_or_moves_by_itself_is_refused() -> None:
     refused(SimulatedDevice(resolution=1e-5), "were not commanded: let go of it")
 
 
+@pytest.mark.parametrize("seconds", [0.5, 3.0, 4.0])
+def test_a_position_that_stops_changing_is_named_with_its_time(seconds: float) -> None:
+    last = np.zeros(3)
+
+    def stuck(sample: NDArray[np.void], tick: int) -> int:
+        if tick * PERIOD <= seconds:
+            last[:] = sample["position"][0]
+        sample["position"][0] = last
+        return 0
+
+    told = refused(Wrapped(free(), stuck), "axis x: its position stopped changing after")
+    assert float(told.split("changing after ")[1].split()[0]) == pytest.approx(seconds, abs=0.05)
+
+
 class LateClock(SimulatedClock):
     """Clock whose every hundredth tick is read three periods late."""
 

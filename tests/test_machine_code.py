@@ -468,6 +468,80 @@ def test_a_run_with_commands_needs_no_numba_once_its_code_is_on_disk() -> None:
     assert process.stdout == "False\n"
 
 
+PUSHED = """
+import sys
+import mujoco
+import numpy as np
+import hapticbridge as hb
+from hapticbridge.device.base import AXES
+from hapticbridge.kernel import machine_code
+
+class Arm:  # six free axes with motors, in Python alone
+    info = hb.DeviceInfo(
+        name="arm", axes=AXES, force_limit=9, damping=2, rotational_damping=0.002, delay=0,
+        is_real=False)
+    damping, mass = np.repeat((2.0, 0.002), 3), np.repeat((0.3, 1e-3), 3)
+    is_pushed = False
+
+    def start(self, period):
+        self.period, self.place, self.speed = period, np.zeros(3), np.zeros(6)
+        self.turn, self.wrench = np.eye(4)[0], np.zeros(6)
+        return np.array([(self.place, self.turn, 0)], hb.SAMPLE_DTYPE)
+
+    def read(self, sample):
+        self.speed += self.period * (self.wrench - self.damping * self.speed) / self.mass
+        self.place += self.period * self.speed[:3]
+        mujoco.mju_quatIntegrate(self.turn, self.speed[3:], self.period)
+        sample[0] = self.place, self.turn, 0
+        return 0
+
+    def write(self, wrench):
+        self.wrench = np.array(wrench)
+        self.is_pushed |= bool(self.wrench.any())
+
+    def close(self):
+        pass
+
+def counted(code, name):
+    late.extend([name] * arm.is_pushed)
+    return load(code, name)
+
+arm, late, load, machine_code.load = Arm(), [], machine_code.load, counted
+with hb.Bridge("point_mass", arm, clock=hb.SimulatedClock(), probe=True) as bridge:
+    print(bridge.run(0.1).probe)
+print(arm.is_pushed, late, "numba" in sys.modules)
+"""
+
+
+def test_nothing_is_compiled_or_loaded_once_a_motor_is_on() -> None:
+    """The probe's first pushes would last as long as that, in which the motor holds its force."""
+    for _ in range(2):
+        process = subprocess.run(
+            [sys.executable, "-c", PUSHED], capture_output=True, text=True, check=True
+        )
+    assert process.stdout == "x, y, z, rx, ry, rz answered the right way\nTrue [] False\n"
+
+
+DRAGGED = """
+import sys
+from types import SimpleNamespace
+from hapticbridge.view.controls import device_pose
+rest = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+axes = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+parameters = SimpleNamespace(axes=axes, handle_origin=rest, device_origin=rest, scale=1.0)
+device_pose(parameters, (0.1, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+print("numba" in sys.modules)
+"""
+
+
+def test_a_drag_on_the_page_needs_no_numba() -> None:
+    """Its import would hold the first drag back."""
+    process = subprocess.run(
+        [sys.executable, "-c", DRAGGED], capture_output=True, text=True, check=True
+    )
+    assert process.stdout == "False\n"
+
+
 END = """
 import hapticbridge as hb
 with hb.Bridge("point_mass", "simulated", clock=hb.SimulatedClock()) as bridge:

@@ -172,13 +172,30 @@ def test_a_hand_that_holds_too_firmly_is_not_judged_and_the_certificate_says_so(
     path = tmp_path / "run.mcap"
     with opened(device, recording=path) as bridge:
         summary = bridge.run(0.3)
-    assert summary.probe == "x, y, z gave no clear answer"
+    still = "the positions of x, y, z never changed (sensor, cable, axis or a firm hand)"
+    assert summary.probe == still
     assert device.gained <= 1e-3
     said = "; the probe could not tell if x, y, z push the right way"
     assert said in summary.certification.words
     judged = audit(path).certification
     assert judged is not None
     assert said in judged.words
+
+
+def test_an_axis_whose_position_never_changes_is_told_from_one_that_answers_unclearly() -> None:
+    class Stuck(Wired):
+        """An own device whose second encoder is broken."""
+
+        def read(self, sample: NDArray[np.void]) -> int:
+            flags = super().read(sample)
+            sample["position"][0, 1] = 0.01
+            return flags
+
+    with opened(Stuck(FINGERS)) as bridge:
+        summary = bridge.run(0.1)
+    still = "the position of y never changed (sensor, cable, axis or a firm hand)"
+    assert summary.probe == f"x, z answered the right way, {still}"
+    assert "the probe could not tell if y push the right way" in summary.certification.words
 
 
 @pytest.mark.parametrize(

@@ -459,3 +459,66 @@ def test_the_last_parts_that_start_elsewhere_are_counted(
     changes = load_scene(tmp_path / "doors.xml").changes
     assert sum("0 deg → 20 deg" in change for change in changes) == 4
     assert f"start of {words} the scene: as these" in changes[-1]
+
+
+KEYS = '<keyframe><key {}qpos="0 0 2 1 0 0 0 .5"/>{}</keyframe>'
+SERVO = '<actuator><position joint="elbow" kp="5"/></actuator>'
+
+
+@pytest.mark.parametrize(
+    ("name", "other", "is_start"),
+    [
+        ("", "", True),
+        ('name="home" ', "", True),
+        ('name="home" ', "<key/>", True),
+        ('name="up" ', "", False),
+        ("", "<key/>", False),
+        ('qvel="0 0 1 0 0 0 0" ', "", False),
+    ],
+)
+def test_the_only_keyframe_at_rest_is_the_start_if_it_has_no_name(
+    tmp_path: Path, name: str, other: str, is_start: bool
+) -> None:
+    keys = KEYS.format(name, other)
+    path = scene_file(tmp_path, scene_text(ARM.format("elbow", 0, ""), SERVO + keys))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        case = case_of(path)
+    scene = case.scene
+    scene.reset()
+    assert scene.data.qpos[2] == pytest.approx(2.0 if is_start else 0.1)
+    assert scene.data.ctrl[0] == pytest.approx(0.5 if is_start else 0.0)  # the servo holds it
+    said = "start: MuJoCo's initial pose → the only keyframe" in scene.changes
+    assert said is (is_start and not name)
+    assert any(fault.kind == "keyframe" for fault in find_faults(case)) == (not is_start)
+
+
+SUNK = """<geom name="bench" type="box" size=".06 .06 .1" pos="0 0 -.1" condim="1"/>
+<body name="block" pos="0 0 .04" gravcomp="1"><joint name="b" {}/>
+<geom name="block" type="box" size=".05 .05 .05" mass=".2" condim="1"/></body>"""
+SLED = '<actuator><position joint="b" kp="50" kv="6"/></actuator>' + (
+    '<keyframe><key name="home" ctrl=".3"/></keyframe>'
+)
+
+
+@pytest.mark.parametrize(
+    ("joint", "rest", "depth"),
+    [
+        ('type="slide" axis="1 0 0"', "", "10 mm"),  # no joint moves it out
+        ('type="slide" axis="0 0 1" range="0 .002"', "", "10 mm"),  # its limit holds it
+        ('type="slide" axis="1 0 0"', SLED, ""),  # drives off the bench
+        ('type="free"', "", ""),  # is moved out before the run
+    ],
+)
+def test_a_summary_says_what_still_overlaps(
+    tmp_path: Path, joint: str, rest: str, depth: str
+) -> None:
+    scene = load_scene(scene_file(tmp_path, scene_text(SUNK.format(joint), rest)))
+    words = "geom 'bench' and geom 'block' overlap by 10 mm"
+    announced = any(f"start where {words}: pushed out at once" in each for each in scene.changes)
+    assert announced == ("free" not in joint)
+    with hb.Bridge(scene, "simulated:hand=none", clock=hb.SimulatedClock()) as bridge:
+        bridge.run(duration=1.0)
+        summary = bridge.summary()
+    assert summary.overlap == (words if depth else "")
+    assert ("overlap             " in str(summary)) == bool(depth)

@@ -34,6 +34,7 @@ from hapticbridge.scene import load_scene
 from hapticbridge.units import format_si
 from hapticbridge.whatif import WhatIf, WhatIfRun, changes_from, write_what_if
 from hapticbridge.whatif import what_if as confined_what_if
+from hapticbridge.whatif.page import rows
 from hapticbridge.whatif.recorded import RecordedRun
 from hapticbridge.whatif.replayed_hand import Repetition, intended
 
@@ -464,8 +465,8 @@ def test_a_motion_that_answers_no_force_is_not_called_a_device_that_answers_late
 ) -> None:
     """Softer, the tool lags more behind the recorded tapping, as a force behind a late device."""
     path, motion = tmp_path / "taps.mcap", tmp_path / "hand.csv"
-    rows = [f"{0.1 * i},0,0,{-0.03 if i % 2 else 0.02}" for i in range(21)]
-    motion.write_text("\n".join(["t,x,y,z", *rows]))
+    points = [f"{0.1 * i},0,0,{-0.03 if i % 2 else 0.02}" for i in range(21)]
+    motion.write_text("\n".join(["t,x,y,z", *points]))
     recorded(path, "virtual_wall", f"simulated:path={motion}", duration=1.5)
     found = what_if(path, {"stiffness": 600})
     alarms = int(TickFlag.SWINGING | TickFlag.RUNS_AWAY)
@@ -474,4 +475,11 @@ def test_a_motion_that_answers_no_force_is_not_called_a_device_that_answers_late
     (note,) = (each for each in found.notes if "does not answer" in each)
     assert "the device is not judged" in note
     assert [run.report.certified for run in found.runs[:2]] == [True, None]
+    table = dict(rows(found))
+    for name in ("peak force on hand", "peak stretch", "device energy", "slack used"):
+        recorded_one, lowered, *_ = table[name]  # a force that was lowered is not the change's
+        assert (recorded_one == "–", lowered) == (False, "–"), name
+    assert table["ran"][1] == "1.500 s"
+    are_lowered = [run["is_lowered"] for run in json.loads(found.to_json())["runs"]]
+    assert are_lowered[:2] == [False, True]
     assert not any("does not answer" in each for each in what_if(path, {}).notes)

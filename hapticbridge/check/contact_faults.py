@@ -11,7 +11,7 @@ from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.observe import clearances
 from hapticbridge.kernel.colliders import MAX_VERTICES
 from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION, REFUSED_PENETRATION
-from hapticbridge.scene.compile import START_KEYFRAME
+from hapticbridge.scene.compile import find_start
 from hapticbridge.scene.contacts import (
     MUJOCO_SOLREF,
     REFERENCE_STEPS,
@@ -309,7 +309,7 @@ def start_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     if beyond:
         yield Fault(
             "start not finite",
-            case.places.named("key", START_KEYFRAME),
+            case.places.start(),
             f"at the start {' and '.join(beyond)} are not finite or beyond {mujoco.mjMAXVAL:g}",
             "numbers of this scene's size",
         )
@@ -327,7 +327,10 @@ def start_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         mover = second if model.body_treeid[model.geom_bodyid[second]] >= 0 else first
         body = int(model.geom_bodyid[mover])
         out = -contact.dist * contact.frame[:3] * (1 if mover == second else -1)
-        effect = "they are held there, and eased out with energy that the scene has dissipated"
+        effect = (
+            "they are held there, and eased out as far as joints and the energy that the scene has "
+            "dissipated allow"
+        )
         if not case.is_rigid:
             effect = (
                 f"more than {length(MAXIMUM_START_PENETRATION)} release energy that is not metered"
@@ -344,10 +347,10 @@ def start_faults(case: SceneUnderCheck) -> Iterator[Fault]:
 def _moved_out(case: SceneUnderCheck, body: int, out: np.ndarray) -> str:
     model = case.model
     by = " ".join(f"{value:.4g}" for value in 1e3 * out)
-    has_home = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME) >= 0
+    has_keyframe = find_start(model) >= 0
     name = model.body(body).name or body
-    if has_home or model.body_parentid[body] != 0:
-        start = "keyframe 'home'" if has_home else "its pos"
+    if has_keyframe or model.body_parentid[body] != 0:
+        start = "keyframe 'home'" if has_keyframe else "its pos"
         return f"move body '{name}' in {start} by {by} mm"
     position = " ".join(f"{value:.6g}" for value in model.body_pos[body] + 1.01 * out)
     return f"pos=\"{position}\" in body '{name}' (moved by {by} mm)"

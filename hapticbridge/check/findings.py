@@ -23,7 +23,7 @@ from hapticbridge.errors import choices
 from hapticbridge.run.fidelity import fidelity
 from hapticbridge.scene import compile_scene
 from hapticbridge.scene.checks import MAY_BE_ACTIVE, coupled_sensors, first_pump, unmetered_work
-from hapticbridge.scene.compile import START_KEYFRAME
+from hapticbridge.scene.compile import START_KEYFRAME, start_among
 from hapticbridge.scene.fault import Fault
 from hapticbridge.scene.first_faults import (
     UNITS,
@@ -109,9 +109,11 @@ def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
 
 def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields a fault if the scene has keyframes but no start among them."""
-    names = [str(key.name) for key in case.source.spec.keys]
-    if names and START_KEYFRAME not in names:
-        listed, place = choices(name for name in names if name), case.places.named("key", names[0])
+    keyframes = list(case.source.spec.keys)
+    if keyframes and start_among(keyframes) < 0:
+        names = [str(keyframe.name) for keyframe in keyframes]
+        listed = choices(name or "one without a name" for name in names)
+        place = case.places.named("key", names[0])
         name = f'name="{START_KEYFRAME}"'
         own = f'<key {name} qpos="…"/> in a <keyframe> of {place.file}'
         yield Fault(

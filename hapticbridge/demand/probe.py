@@ -66,6 +66,9 @@ TREMOR = 5e-4, 8e-3
 """Way in m and angle in rad that a hand goes by itself. A wrong direction that is found in less of
 a motion is looked at with the larger force."""
 
+ROUNDED = 1e-12
+"""Way in m or rad to which equal samples round; no unit's position has steps so fine."""
+
 MISFIT, RATIO = 0.05, 5.0
 """Largest E of a hypothesis that holds, and least ratio of the others' to it, without unit."""
 
@@ -111,12 +114,14 @@ class Answer:
         moved: Name of the axis that moved; empty if it is unknown.
         delay: Time in s from a write to its effect in a sample; of a right direction only if it is
             beyond the stated one, else 0.
+        is_still: True if the position along this axis was the same in each sample.
     """
 
     axis: str
     direction: Direction = Direction.UNKNOWN
     moved: str = ""
     delay: float = 0.0
+    is_still: bool = False
 
     @property
     def is_wrong(self) -> bool:
@@ -165,8 +170,13 @@ class Probed:
         """Findings in a line."""
         if self.skipped:
             return f"not probed: {self.skipped}"
-        right, unknown = self.axes(Direction.RIGHT), self.axes(Direction.UNKNOWN)
+        right, still = self.axes(Direction.RIGHT), [a.axis for a in self.answers if a.is_still]
+        others = (a for a in self.answers if a.direction == Direction.UNKNOWN and not a.is_still)
+        unknown = ", ".join(a.axis for a in others)
         texts = [f"{right} answered the right way"] if right else []
+        if still:
+            each = f"the position{'s' if len(still) > 1 else ''} of {', '.join(still)}"
+            texts.append(f"{each} never changed (sensor, cable, axis or a firm hand)")
         texts += [f"{unknown} gave no clear answer"] if unknown else []
         if self.delay:
             texts.append(f"the force acts {format_si(self.delay, 's')} after the sample")
@@ -279,9 +289,15 @@ class Push:
         """Longest way in m, or angle in rad, from the start."""
         return float(np.abs(self.places).max()) if self.places else 0.0
 
+    @property
+    def _is_still(self) -> bool:
+        own = [place[self.axis % 3] for place in self.places]
+        return bool(own) and max(own) - min(own) <= ROUNDED
+
     def answer(self, hand: ProbedHand) -> Answer:
         """Judges the motion."""
-        own, unknown = self.axis % 3, Answer(AXES[self.axis])
+        own = self.axis % 3
+        unknown = Answer(AXES[self.axis], is_still=self._is_still)
         first = self.axis - own
         if len(self.times) < 3 * len(SIGNS) or not self.changes:
             return unknown

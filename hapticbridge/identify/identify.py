@@ -26,6 +26,7 @@ from hapticbridge.errors import DeviceError, IdentificationError
 from hapticbridge.identify.excitation import (
     FAR,
     FAST,
+    LOWEST,
     OK,
     SPAN,
     START_SHARE,
@@ -268,6 +269,10 @@ named beside the device; without unit."""
 PRECISION = 0.2
 """Largest usable half-width of the mass, relative to its value, without unit."""
 
+LONGER = 3.0
+"""Least ratio of the time at the end of a run without a change of the position, for a position that
+has stopped, to each earlier rest; without unit. It is also at least a swing of the slowest tone."""
+
 MAX_STALE = 1 / 3
 """Largest share of ticks without a new sample, without unit. Beyond it the loop is too fast for the
 device."""
@@ -416,6 +421,12 @@ def _checked_fit(run: AxisRun, info: DeviceInfo) -> AxisFit:
             "handle by hand: if it does not change then, check its encoders and calibration, and "
             "else the power of its motors, or raise --force-share against friction"
         )
+    if (stopped := _stop_of(run)) is not None:
+        raise IdentificationError(
+            f"{where}: its position stopped changing after {stopped:.2f} s, and the force went on "
+            f"for {len(run.position) * run.period - stopped:.2f} s; move the handle by hand: if it "
+            "does not change then, check its encoder and cable, and else what holds the handle"
+        )
     step = step_of(run.position) or info.resolution or 0.0
     try:
         fit = fit_axis(run.position, run.force, run.period, 0.0 if turns else step)
@@ -449,6 +460,20 @@ def _checked_fit(run: AxisRun, info: DeviceInfo) -> AxisFit:
             "(--duration)"
         )
     return fit
+
+
+def _stop_of(run: AxisRun) -> float | None:
+    """Returns the time in s after which the position never changed, or None if it went on.
+
+    A device that sticks now and then has rested as long before.
+    """
+    (fresh,) = np.nonzero(np.isfinite(run.position))
+    changed = fresh[1:][np.diff(run.position[fresh]) != 0.0]
+    rested = np.diff(changed, prepend=0).max(initial=0)
+    silent = int(fresh[-1] - changed[-1])
+    if silent * run.period <= max(stretch(run.period) / LOWEST, LONGER * rested * run.period):
+        return None
+    return float(changed[-1] * run.period)
 
 
 def _resolution(info: DeviceInfo, runs: dict[str, AxisRun]) -> float | None:

@@ -167,7 +167,14 @@ class HandEnergy:
             origins[-1] += f", and {_BOUND}"
         if self.ratio * self.springs > INSTANT:
             springs = format_energy(self.springs)
-            origins.append(f"the coupling's springs held {springs} at the start or after resets")
+            held = f"the coupling's springs held {springs} at the start or after resets"
+            others = [
+                f", and the scene's {name}, which may have loaded them, gave or took up to "
+                f"{format_energy(work)}"
+                for name, work in works.items()
+                if name not in self._pushing and self.ratio * work > INSTANT
+            ]
+            origins.append(held + "".join(others))
         if self.fault and self.unpaid > self.hidden:
             origins.append(f"nothing paid for {format_energy(self.unpaid)} of it")
         if not origins:

@@ -778,6 +778,7 @@ class Session:
             start_potential=self._start_potential,
             trip=self.last_trip,
             own_loop=None if self._own_loop is None else self._own_loop.tally.account,
+            overlap=self.setup.scene.remaining_overlap(),
         )
         hands = [
             Summary.from_state(

@@ -161,6 +161,7 @@ class RunOutcome:
         trip: Stop by the guard; None without one.
         probed: Result of the probe of the hand's device; None without one.
         own_loop: Account of a loop of the device's own; None without one.
+        overlap: Pairs of the scene that began inside each other and still are; empty without any.
     """
 
     ticks: int
@@ -174,6 +175,7 @@ class RunOutcome:
     trip: Trip | None = None
     probed: Probed | None = None
     own_loop: OwnLoopAccount | None = None
+    overlap: str = ""
 
     def added_delay(self, info: DeviceInfo, period: float) -> float:
         """Returns the delay in s that the probe found beyond the stated one."""
@@ -259,6 +261,7 @@ class Summary:
             ended any early; None without.
         trip: Stop by the guard; None without one.
         probe: Result of the probe of the device before the run, as a clause; empty without one.
+        overlap: Pairs of the scene that began inside each other and still are; empty without any.
         hands: Summary of each hand by itself, if several hold the scene. Fault, share of the slack
             and certification of the whole are then those of all of them.
     """
@@ -294,6 +297,7 @@ class Summary:
     pulses: tuple[float, float, int] | None = None
     trip: Trip | None = None
     probe: str = ""
+    overlap: str = ""
     hands: tuple[Summary, ...] = ()
 
     def at_record(self, record: np.void) -> Summary:
@@ -428,6 +432,8 @@ class Summary:
         """Yields name and text of what was counted and measured."""
         yield "ran", f"{self.duration:.3f} s, {self.ticks} ticks ({self.stopped_by})"
         skipped = f" ({self.skipped} deadlines skipped)" if self.skipped else ""
+        if self.overlap:
+            yield "overlap", f"{self.overlap} still; the scene began so"
         yield "overruns", f"{self.overruns}{skipped}, records dropped {self.dropped}"
         if self.probe:
             yield "probe", self.probe
@@ -580,6 +586,7 @@ class Summary:
             credit=parameters.credit,
             trip=outcome.trip,
             probe=outcome.probed.words if outcome.probed else "",
+            overlap=outcome.overlap,
             grip=parameters.grip,
             device=info.name,
             pulses=(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -67,7 +68,8 @@ def unfused_model(spec: mujoco.MjSpec) -> mujoco.MjModel:
 # Start of a scene, with the handle at the grip
 
 START_KEYFRAME = "home"
-"""Name of the keyframe that a scene starts from; without it a scene starts from ``qpos0``."""
+"""Name of the keyframe that a scene starts from. A scene's only keyframe is one too if it has no
+name and is at rest; without either a scene starts from ``qpos0``."""
 
 
 def handles(model: mujoco.MjModel, grip: str) -> tuple[tuple[int, int], ...]:
@@ -81,7 +83,15 @@ def handles(model: mujoco.MjModel, grip: str) -> tuple[tuple[int, int], ...]:
 
 def find_start(model: mujoco.MjModel) -> int:
     """Returns the id of the keyframe that a scene starts from, or -1."""
-    return int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME))
+    return start_among([model.key(key) for key in range(model.nkey)])
+
+
+def start_among(keyframes: Sequence[Any]) -> int:
+    """Returns the index of the start among all keyframes of a scene or specification, or -1."""
+    if len(keyframes) == 1 and not keyframes[0].name and not np.any(keyframes[0].qvel):
+        return 0
+    names = [keyframe.name for keyframe in keyframes]
+    return names.index(START_KEYFRAME) if START_KEYFRAME in names else -1
 
 
 def reset(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -122,7 +132,7 @@ def seat_handle(model: mujoco.MjModel, grip: str) -> None:
 
 
 def hold_servos(model: mujoco.MjModel) -> tuple[SceneChange, ...]:
-    """Aims the position servos at their pose in keyframe ``home`` if this has no controls.
+    """Aims the position servos at their pose in the start's keyframe if this has no controls.
 
     MuJoCo reads missing controls as zeros, so that the servos would fling the scene out of the pose
     that the keyframe describes.
@@ -148,7 +158,8 @@ def hold_servos(model: mujoco.MjModel) -> tuple[SceneChange, ...]:
     count = f"{len(moved)} servo{'s' if len(moved) > 1 else ''}"
     if not moved:
         return ()
-    words = f"ctrl of {count} in keyframe '{START_KEYFRAME}': 0 → its pose"
+    name = f"keyframe '{START_KEYFRAME}'" if model.key(key).name else "the only keyframe"
+    words = f"ctrl of {count} in {name}: 0 → its pose"
     return (SceneChange(words, "servos"),)
 
 

@@ -671,8 +671,8 @@ def announce_overlaps(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Scene
     """Returns the change in the treatment of what overlaps at the start."""
     if overlapping := overlaps(model, data, NOTABLE_OVERLAP):
         words = (
-            f"start where {listed(overlapping)}: pushed out at once → held, and eased out with "
-            "energy that the scene has dissipated"
+            f"start where {listed(overlapping)}: pushed out at once → held, and eased out as far "
+            "as joints and the energy that the scene has dissipated allow"
         )
         return (SceneChange(words, "overlap"),)
     return ()

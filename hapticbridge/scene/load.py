@@ -452,7 +452,9 @@ def _start_set(
             model = spec.compile()
         model.key_qpos[find_start(model)] = start.positions
     held = hold_servos(model) if has_keyframe and not as_is else ()
-    return model, start.changes + held, start.remaining
+    only = SceneChange("start: MuJoCo's initial pose → the only keyframe", "only keyframe")
+    first = (only,) if has_keyframe and not model.key(find_start(model)).name else ()
+    return model, first + start.changes + held, start.remaining
 
 
 @contextmanager

@@ -34,7 +34,7 @@ from hapticbridge.kernel.rigid_contact import (
     largest_margin,
     rigid_margins,
 )
-from hapticbridge.scene.checks import refuse_callbacks
+from hapticbridge.scene.checks import NOTABLE_OVERLAP, listed, overlaps, refuse_callbacks
 from hapticbridge.scene.compile import PROGRAM_CREDIT, clause, custom_numbers, go_to_start
 from hapticbridge.scene.handle import (
     add_weld,
@@ -245,6 +245,19 @@ class Scene:
         position, quaternion = self.data.site_xpos[site_id], self.data.site_xquat[site_id]
         sign = 1.0 if quaternion[0] >= 0 else -1.0
         return tuple(float(value) for value in (*position, *(sign * quaternion)))
+
+    def remaining_overlap(self) -> str:
+        """Returns the pairs that overlap now, of a scene that began so; empty if none does."""
+        if not any(change.subject == "overlap" for change in self.differences):
+            return ""
+        now = mujoco.MjData(self.model)  # another thread may step the scene's own
+        for name in ("qpos", "mocap_pos", "mocap_quat"):
+            getattr(now, name)[:] = getattr(self.data, name)
+        if not np.isfinite(now.qpos).all():
+            return ""
+        mujoco.mj_fwdPosition(self.model, now)
+        overlapping = overlaps(self.model, now, NOTABLE_OVERLAP)
+        return listed(overlapping) if overlapping else ""
 
     def set_timestep(self, scene_period: float, substeps: int = 1) -> None:
         """Sets MuJoCo's timestep to scene_period / substeps, in s.

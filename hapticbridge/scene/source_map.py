@@ -120,6 +120,11 @@ class Places:
         found = self._first((tag,), lambda element: element.attributes.get("name") == name)
         return found or Place(self._main, 0, f"{tag} '{name}'")
 
+    def start(self) -> Place:
+        """Returns the place of the keyframe that the scene starts from, or would start from."""
+        named = self.named("key", START_KEYFRAME)
+        return named if named.line else self._first(("key",), _is_nameless) or named
+
     def option(self, attribute: str) -> Place:
         """Returns the place at which <option> sets an attribute, or at which it would be set."""
         return (
@@ -151,7 +156,7 @@ class Places:
         if set(tags) <= {"option", "flag"}:
             return self.option(pairs[0][1])
         if tags == ["key"]:  # a run starts at no other
-            return self.named("key", START_KEYFRAME)
+            return self.start()
         found = {
             Place(file, element.line, _describe(element))
             for file, elements in self._files
@@ -219,6 +224,10 @@ class Places:
                 if (not tags or element.tag in tags) and fits(element):
                     return Place(file, element.line, _describe(element))
         return None
+
+
+def _is_nameless(element: Element) -> bool:
+    return "name" not in element.attributes
 
 
 def _describe(element: Element) -> str:

@@ -194,15 +194,20 @@ TREATMENTS: dict[str, Treatment] = {
         "such a contact only jams the joint",
     ),
     "overlap": Treatment(
-        "key", "", "changed", "overlaps that cannot be moved apart are eased out",
+        "key", "", "changed",
+        "overlaps that cannot be moved apart are held, and eased out as far as joints allow",
         "pushing out at once would create energy",
     ),
     "start": Treatment(
         "key", "qpos", "changed", "moved onto limits, equality constraints and contacts",
         "rigid ones would hold the violation",
     ),
+    "only keyframe": Treatment(
+        "key", "name", "changed", "the start, if it is the only one, at rest and has no name",
+        "the file names no other start",
+    ),
     "servos": Treatment(
-        "key", "ctrl", "changed", "the pose of `home` where position servos have no control",
+        "key", "ctrl", "changed", "the pose of the keyframe where position servos have no control",
         "zeros would fling the scene out of its pose",
     ),
 }  # fmt: skip

@@ -388,7 +388,7 @@ class RobomimicWriter:
         self._data, self._shot = self._file.root.create_group("data"), shot
         self._data.attrs["task"] = task
         self._actions: list[NDArray[np.float32]] = []
-        self._total = 0
+        self._total, self._scenes = 0, dict[str, None]()
 
     def add(self, episode: Episode) -> None:
         """Implements ``Writer.add``."""
@@ -411,9 +411,8 @@ class RobomimicWriter:
         for name, values in observed.items():
             demo[f"obs/{name}"] = values
             demo[f"next_obs/{name}"] = np.concatenate([values[1:], values[-1:]])
-        if not self._actions:
-            about = {"env_name": episode.scene, "type": 2, "env_kwargs": {"fps": self._shot.fps}}
-            self._data.attrs["env_args"] = json.dumps(about)
+        demo.attrs["scene"] = printable(episode.scene)
+        self._scenes[episode.scene] = None
         self._actions.append(episode.values[ACTION])
         self._total += count
         self._file.check()
@@ -433,6 +432,10 @@ class RobomimicWriter:
             # rounding may lead a number out by 1e-7
             normalised = np.clip((actions - offset) / scale, -1.0, 1.0)
             self._data[f"demo_{number}/actions"] = normalised
+        # robomimic reads one environment for all episodes
+        name, rate = ", ".join(self._scenes), {"fps": self._shot.fps}
+        about = {"env_name": name, "type": 2, "env_kwargs": rate}
+        self._data.attrs["env_args"] = json.dumps(about)
         self._data.attrs["action_offset"], self._data.attrs["action_scale"] = offset, scale
         self._data.attrs["action_names"] = [*POSE, *WRENCH]
         self._data.attrs["total"] = self._total

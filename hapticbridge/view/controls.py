@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
+import mujoco
 import numpy as np
 import viser
 
@@ -23,13 +24,6 @@ from hapticbridge.demand.methods import RunCoupling
 from hapticbridge.device.mouse import REST, Drag, Pose, line_of_drag
 from hapticbridge.errors import CommandError
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.pose import (
-    conjugate,
-    product,
-    quaternion_exp,
-    quaternion_of,
-    rotation_between,
-)
 from hapticbridge.run.commands import (
     INTERVAL,
     AxisCouplingLimits,
@@ -335,10 +329,14 @@ def device_pose(
     start, origin = np.array(parameters.handle_origin), np.array(parameters.device_origin)
     moved = axes.T @ (handle - start[:3]) / parameters.scale + origin[:3]
     size = float(np.linalg.norm(turned))
-    turn = product(quaternion_of(turned / size), conjugate(quaternion_of(start[3:])))
-    x, y, z = (axes.T @ rotation_between((1.0, 0.0, 0.0, 0.0), turn)).tolist()
-    w, a, b, c = product(quaternion_exp((x, y, z)), quaternion_of(origin[3:]))
-    return float(moved[0]), float(moved[1]), float(moved[2]), w, a, b, c
+    # by MuJoCo: the compiled functions of kernel.pose would be loaded within the first drag
+    back, turn, device = np.zeros((3, 4))
+    mujoco.mju_negQuat(back, start[3:])
+    mujoco.mju_mulQuat(turn, turned / size, back)
+    turn[1:] = axes.T @ turn[1:]  # Aᵀ R A turns as far, about the axis Aᵀ n
+    mujoco.mju_mulQuat(device, turn, origin[3:])
+    x, y, z, w, a, b, c = map(float, (*moved, *device))
+    return x, y, z, w, a, b, c
 
 
 def add_hand(

@@ -49,7 +49,10 @@ COUPLINGS = {"effective": "K, B", "law": "K, B_law", "requested": "K, B as set"}
 
 
 def rows(what_if: WhatIf) -> Iterator[Row]:
-    """Yields a name and a text per run, in the order of its runs."""
+    """Yields a name and a text per run, in the order of its runs.
+
+    A run whose force was lowered (``WhatIfRun.is_lowered``) has a dash in place of its numbers.
+    """
     runs, reports = what_if.runs, [run.report for run in what_if.runs]
     for hand, grip in enumerate(runs[0].report.hands or ("",)):
         of_hand = [_coupling(run, hand) for run in runs]
@@ -69,6 +72,21 @@ def rows(what_if: WhatIf) -> Iterator[Row]:
     if len(set(weights)) > 1:  # a device that cannot hold it makes the scene carry it
         yield "weight of the tool", weights
     yield "verdict", tuple(f"{r.words}, tripped" if r.trip else r.words for r in reports)
+    for name, texts in _numbers(what_if):
+        yield (
+            name,
+            tuple("–" if run.is_lowered else text for run, text in zip(runs, texts, strict=True)),
+        )
+    yield (
+        "device bears it",
+        tuple(each.answer for each in reports),
+    )
+    yield "ran", tuple(f"{run.report.duration:.3f} s" for run in runs)
+
+
+def _numbers(what_if: WhatIf) -> Iterator[Row]:
+    """Yields peaks and energies of the runs."""
+    runs = what_if.runs
     for name in runs[0].peaks:
         unit = unit_of(Limits, name.split()[0])
         yield f"peak {name}", tuple(format_si(run.peaks[name], unit) for run in runs)
@@ -80,11 +98,6 @@ def rows(what_if: WhatIf) -> Iterator[Row]:
     if any(run.report.max_net_energy > INSTANT for run in runs):
         yield "net to the hand", tuple(format_energy(run.report.max_net_energy) for run in runs)
     yield "slack used", tuple(format_share(run.report.slack_share) for run in runs)
-    yield (
-        "device bears it",
-        tuple(each.answer for each in reports),
-    )
-    yield "ran", tuple(f"{run.report.duration:.3f} s" for run in runs)
 
 
 def _coupling(run: WhatIfRun, hand: int) -> RunCoupling | None:

@@ -46,7 +46,8 @@ from hapticbridge.whatif.settings import Change, Settings, Value, changed_of_han
 
 NO_ANSWER = (
     "the watch for a late or reversed force acted in the prescribed run, because a recorded motion "
-    "does not answer the changed force: the force is lowered there, and the device is not judged"
+    "does not answer the changed force: the force is lowered there, so its numbers say nothing of "
+    "the change (–), and the device is not judged"
 )
 """Note on a prescribed run whose force was lowered for a motion that no force can change."""
 
@@ -72,6 +73,8 @@ class WhatIfRun:
             handle and tool in m, by name. Those on the hand are left out for a prescribed motion.
         period: T in s.
         recordings: Its recording, once per hand; that of a changed run exists in memory only.
+        is_lowered: True if its force was lowered for a motion that no force can change
+            (``NO_ANSWER``): its numbers are not those of the change.
     """
 
     name: str
@@ -79,6 +82,7 @@ class WhatIfRun:
     peaks: dict[str, float]
     period: float
     recordings: tuple[Recording, ...]
+    is_lowered: bool = False
 
     @property
     def recording(self) -> Recording:
@@ -128,6 +132,7 @@ class WhatIf:
             "runs": [
                 {
                     "name": run.name,
+                    "is_lowered": run.is_lowered,
                     "peaks": run.peaks,
                     "trip": run.report.trip and run.report.trip.sentence,
                     "report": json.loads(run.report.to_json()) | {"path": str(self.path)},
@@ -287,7 +292,7 @@ class _Experiment:
             notes.append(self._agreement())
         elif _alarms(runs[-1]) & ~_alarms(recorded):
             unjudged = replace(runs[-1].report, certification=None)
-            runs[-1] = replace(runs[-1], report=unjudged)
+            runs[-1] = replace(runs[-1], report=unjudged, is_lowered=True)
             notes.append(NO_ANSWER)
         notes.extend(_missing_parts(run, Repetition(self.hands, new)))
         if run.trip:
