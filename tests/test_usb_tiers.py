@@ -1,4 +1,4 @@
-"""Drivers, libraries and kernel on emulated devices: tiers B and C, where this machine can."""
+"""Drivers, libraries and kernel on emulated devices, where this machine can."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hapticbridge.recording.writer import RecordingWriter
 
 
 @pytest.mark.parametrize("job", JOBS, ids=lambda job: job.name)
-def test_what_a_tier_claims_holds(job: Job, tmp_path: Path) -> None:
+def test_what_a_job_claims_holds(job: Job, tmp_path: Path) -> None:
     if (reason := job.missing()) is not None:
         pytest.skip(reason)
     claims = job.run(tmp_path)
@@ -30,15 +30,15 @@ def test_what_a_tier_claims_holds(job: Job, tmp_path: Path) -> None:
 def test_a_job_that_cannot_run_is_skipped_with_the_reason_and_a_false_claim_fails_the_run(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    skipped = Job("C: skipped", lambda: NO_KERNEL, lambda _: [Claim("never", is_true=False)])
+    skipped = Job("on a kernel", lambda: NO_KERNEL, lambda _: [Claim("never", is_true=False)])
     unknown = Claim("unknown", is_true=None, note="no such driver")
     true = Claim("true", is_true=True, note="5 trips/s")
-    good = Job("B: good", lambda: None, lambda _: [true, unknown])
-    bad = Job("B: bad", lambda: None, lambda _: [Claim("false", is_true=False, note="why")])
+    good = Job("good", lambda: None, lambda _: [true, unknown])
+    bad = Job("bad", lambda: None, lambda _: [Claim("false", is_true=False, note="why")])
     monkeypatch.setattr("emulated.tiers.JOBS", (skipped, good))
     assert main() == 0
     said = capsys.readouterr().out
-    assert f"skipped  C: skipped: {NO_KERNEL}" in said
+    assert f"skipped  on a kernel: {NO_KERNEL}" in said
     assert "ok   true: 5 trips/s" in said
     assert "skip unknown: no such driver" in said
     monkeypatch.setattr("emulated.tiers.JOBS", (skipped, good, bad))
@@ -117,7 +117,7 @@ def test_in_virtual_time_a_program_that_reads_the_clock_oftener_is_later(tmp_pat
         folder = tmp_path / str(number)
         folder.mkdir()
         command = [sys.executable, "-I", "-S", "-c", program]
-        ended = run_in_guest(command, folder, environment={}, is_virtual=True)
+        ended = run_in_guest(command, folder, environment={})
         told.append(int(ended.output))
     assert told[1] == told[0]
     assert told[2] - told[0] == pytest.approx(1000 * 256, rel=0.01)
@@ -126,14 +126,14 @@ def test_in_virtual_time_a_program_that_reads_the_clock_oftener_is_later(tmp_pat
 @pytest.mark.skipif(kernel() is None, reason=NO_KERNEL)
 def test_a_guest_says_how_its_command_ended_and_one_that_hangs_is_stopped(tmp_path: Path) -> None:
     command = ["sh", "-c", 'echo "$WHAT"; test -e /dev/uhid && exit 7']
-    ended = run_in_guest(command, tmp_path, environment={"WHAT": "it's here"}, is_virtual=True)
+    ended = run_in_guest(command, tmp_path, environment={"WHAT": "it's here"})
     assert (ended.status, ended.output) == (7, "it's here\n")
     dying = ["sh", "-c", "echo '<1>memory is full' >/dev/kmsg; kill -9 $$"]
-    killed = run_in_guest(dying, tmp_path, environment={}, is_virtual=True)
+    killed = run_in_guest(dying, tmp_path, environment={})
     assert killed.status == 137
     assert "memory is full" in killed.output
     endless = ["sh", "-c", "while :; do i=0; while [ $i -lt 999 ]; do i=$((i+1)); done; echo; done"]
-    limits: Any = {"environment": {}, "is_virtual": True, "patience": 3.0}
+    limits: Any = {"environment": {}, "patience": 3.0}
     stopped = run_in_guest(endless, tmp_path, timeout=4.0, **limits)
     assert stopped.status is None
     assert stopped.output.endswith("\nthe guest was stopped after 4 s")

@@ -1,16 +1,13 @@
-"""Jobs of tiers B and C: the commands, the needs and the findings of each.
+"""Jobs in a User-Mode Linux, real libraries on a real kernel: their commands, needs and findings.
 
-Tier A, in process, is the project's ordinary tests. Tier B is real hidapi and libusb under
-umockdev's preload library. Tier C is a User-Mode Linux: real libraries on a real kernel. Run as a
-program, it runs all jobs and prints what ran and what was skipped and why.
+The project's ordinary tests drive the same emulated devices in process. Run as a program, it runs
+all jobs and prints what ran and what was skipped and why.
 """
 
 from __future__ import annotations
 
-import ctypes
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 import threading
@@ -20,7 +17,6 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,10 +25,6 @@ from emulated import guest
 from emulated.compile_ahead import compile_ahead, snapshot_of_compiled_code
 from emulated.guest import CHECKOUT, NO_KERNEL, GuestRun, kernel
 from emulated.parting import repeated
-from emulated.umock_sysfs import make_test_bed
-
-PRELOAD = "libumockdev-preload.so.0"
-NO_UMOCKDEV = "no umockdev; 'apt-get install umockdev libusb-1.0-0' brings it"
 
 CHECKS = CHECKOUT / "tests/usb_tiers"
 LIMIT = 600.0
@@ -63,10 +55,10 @@ class Claim:
 
 @dataclass(frozen=True)
 class Job:
-    """Something to run in a tier.
+    """Something to run in a guest.
 
     Attributes:
-        name: Its tier and what it does there.
+        name: What it does.
         missing: Says what this machine lacks for it, None where nothing.
         run: Runs it, with an empty folder to write to.
     """
@@ -76,25 +68,17 @@ class Job:
     run: Callable[[Path], list[Claim]]
 
 
-def _umockdev_missing() -> str | None:
-    try:
-        ctypes.CDLL(PRELOAD)
-    except OSError:
-        return NO_UMOCKDEV
-    return None
-
-
 def _kernel_missing() -> str | None:
     return None if kernel() is not None else NO_KERNEL
 
 
-def _pytest(report: str, files: str = "check_*.py", only: str = "test") -> list[str]:
-    """Returns the command that runs checks, apart from the project's own tests."""
-    paths = sorted(str(path) for path in CHECKS.glob(files))
+def _pytest(report: str) -> list[str]:
+    """Returns the command that runs the checks, apart from the project's own tests."""
+    paths = sorted(str(path) for path in CHECKS.glob("*check_*.py"))
     plain = ["--rootdir", str(CHECKS), "-c", os.devnull, "-p", "no:cacheprovider"]
     # line by line, so that what is stopped says where it stood
     form = ["--tb=short", "-v", f"--junitxml={report}", "-o", "junit_family=xunit1"]
-    return [sys.executable, "-m", "pytest", *plain, *form, "-k", only, *paths]
+    return [sys.executable, "-m", "pytest", *plain, *form, *paths]
 
 
 def claims_of(report: Path, otherwise: str) -> list[Claim]:
@@ -115,40 +99,19 @@ def claims_of(report: Path, otherwise: str) -> list[Claim]:
     return claims
 
 
-def _under_umockdev(folder: Path) -> list[Claim]:
-    bed, report = folder / "bed", folder / "report.xml"
-    make_test_bed(bed)
-    variables = {
-        "LD_PRELOAD": PRELOAD,
-        "UMOCKDEV_DIR": str(bed),
-        "HAPTICBRIDGE_TIER": "umock",
-        "PYTHONPATH": f"{CHECKOUT}:{CHECKOUT / 'tests'}",
-    }
-    try:
-        command = [*_pytest(str(report)), f"--basetemp={folder / 'files'}"]
-        how: Any = {"capture_output": True, "text": True, "timeout": LIMIT}
-        ended = subprocess.run(command, env=os.environ | variables, check=False, **how)
-    except subprocess.TimeoutExpired:
-        return [Claim("the job ran", is_true=False, note=f"stopped after {LIMIT:g} s")]
-    return claims_of(report, ended.stdout + ended.stderr)
-
-
 def _in_the_guest(
     folder: Path,
     command: Sequence[str],
     *,
-    is_virtual: bool,
     patience: float | None = None,
     compiled: Path | None = None,
 ) -> GuestRun:
     _compile_ahead()
-    variables = guest.python_environment() | {"HAPTICBRIDGE_TIER": "uml"}
-    if is_virtual:
-        variables["HAPTICBRIDGE_TIME"] = "virtual"
+    variables = guest.python_environment()
     if not guest.has_pidff():
         variables["HAPTICBRIDGE_NO_PIDFF"] = "1"
     limits = {"timeout": LIMIT, "patience": patience}
-    how = {"environment": variables, "is_virtual": is_virtual, "compiled": compiled}
+    how = {"environment": variables, "compiled": compiled}
     return guest.run_in_guest(command, folder, **limits, **how)  # type: ignore[arg-type]
 
 
@@ -161,15 +124,10 @@ def _compile_ahead() -> None:
         compile_ahead()
 
 
-def _checks(folder: Path, *which: str, is_virtual: bool) -> list[Claim]:
-    """Runs checks in a guest, and finds what they claim."""
-    command = _pytest("/run/job/report.xml", *which)
-    run = _in_the_guest(folder, command, is_virtual=is_virtual, patience=guest.PATIENCE)
+def _checks(folder: Path) -> list[Claim]:
+    """Runs the checks in a guest, and finds what they claim."""
+    run = _in_the_guest(folder, _pytest("/run/job/report.xml"), patience=guest.PATIENCE)
     return claims_of(folder / "report.xml", run.output)
-
-
-def _checks_in_virtual_time(folder: Path) -> list[Claim]:
-    return _checks(folder, "*check_*.py", is_virtual=True)
 
 
 def _recorded(
@@ -179,7 +137,7 @@ def _recorded(
     folder.mkdir(exist_ok=True)
     command = [sys.executable, "-m", "usb_tiers.closed_loop", "/run/job"]
     command += [f"{device}:{seconds:g}" for device, seconds in loops.items()]
-    ended = _in_the_guest(folder, command, is_virtual=True, compiled=compiled)
+    ended = _in_the_guest(folder, command, compiled=compiled)
     return ended, [folder / f"{device}.mcap" for device in loops]
 
 
@@ -217,10 +175,9 @@ def _the_same_every_time(folder: Path) -> list[Claim]:
 
 
 JOBS = (
-    Job("C: checks in User-Mode Linux, virtual time", _kernel_missing, _checks_in_virtual_time),
-    Job("C: closed loops", _kernel_missing, _closed_loops),
-    Job("C: 1 kHz loop, repeated", _kernel_missing, _the_same_every_time),
-    Job("B: checks under umockdev", _umockdev_missing, _under_umockdev),
+    Job("checks of the drivers", _kernel_missing, _checks),
+    Job("closed loops", _kernel_missing, _closed_loops),
+    Job("1 kHz loop, repeated", _kernel_missing, _the_same_every_time),
 )
 
 
