@@ -94,14 +94,12 @@ def run_in_guest(
     environment: Mapping[str, str],
     timeout: float = 120.0,
     patience: float | None = None,
-    compiled: Path | None = None,
 ) -> GuestRun:
     """Runs a command as the only job of a freshly booted guest.
 
     Time is virtual: it passes only while everything in the guest waits, so that nothing depends on
     this machine's speed. It passes by 256 ns with each reading of the clock too, or who waits for
-    it by reading would wait for ever. So what a program does before shifts what it does after: two
-    runs are the same only if they also find the same byte code and machine code, or both find none.
+    it by reading would wait for ever. The guest writes to this machine's folder of compiled code.
 
     Args:
         command: The command and its arguments.
@@ -109,8 +107,6 @@ def run_in_guest(
         environment: Variables for the command.
         timeout: In s of this machine's time.
         patience: Likewise: for how long it may print nothing; None: for as long as it likes.
-        compiled: Folder of compiled functions, to which it may write; None: this machine's, shared
-            with whoever compiles meanwhile.
     """
     program = kernel()
     if program is None:
@@ -119,7 +115,7 @@ def run_in_guest(
     (folder / "command").write_text("\n".join([*exports, shlex.join(command)]) + "\n")
     (folder / "status").unlink(missing_ok=True)
     root = "root=/dev/root rootfstype=hostfs rootflags=/ ro quiet con=null con0=null,fd:1 ssl=null"
-    job = [f"job={folder}", f"compiled={compiled or _compiled_code()}"]
+    job = [f"job={folder}", f"compiled={_compiled_code()}"]
     init = f"init={CHECKOUT / 'tests/uml/init'}"
     virtual_time = "time-travel=inf-cpu"
     arguments = [str(program), f"mem={_MEMORY_MIB}M", *root.split(), init, *job, virtual_time]

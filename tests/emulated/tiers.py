@@ -7,13 +7,12 @@ all jobs and prints what ran and what was skipped and why.
 from __future__ import annotations
 
 import os
-import shutil
 import sys
 import tempfile
 import threading
 import time
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,9 +21,8 @@ import numpy as np
 
 import hapticbridge as hb
 from emulated import guest
-from emulated.compile_ahead import compile_ahead, snapshot_of_compiled_code
+from emulated.compile_ahead import compile_ahead
 from emulated.guest import CHECKOUT, NO_KERNEL, GuestRun, kernel
-from emulated.parting import repeated
 
 CHECKS = CHECKOUT / "tests/usb_tiers"
 LIMIT = 600.0
@@ -33,9 +31,6 @@ LIMIT = 600.0
 LOOPS = {"falcon": 3.0, "rawhid": 3.0, "pid": 4.0}
 """Closed loops, and the virtual time in s of each: a run begins some 2 s into the hand's path, and
 the home-made device's peg touches its hole 2 s later."""
-
-REPEATS, REPEATED_LOOP = 2, 1.0
-"""Number of runs that must be equal to the bit, and the length of each in s of virtual time."""
 
 
 @dataclass(frozen=True)
@@ -100,19 +95,15 @@ def claims_of(report: Path, otherwise: str) -> list[Claim]:
 
 
 def _in_the_guest(
-    folder: Path,
-    command: Sequence[str],
-    *,
-    patience: float | None = None,
-    compiled: Path | None = None,
+    folder: Path, command: Sequence[str], *, patience: float | None = None
 ) -> GuestRun:
     _compile_ahead()
     variables = guest.python_environment()
     if not guest.has_pidff():
         variables["HAPTICBRIDGE_NO_PIDFF"] = "1"
-    limits = {"timeout": LIMIT, "patience": patience}
-    how = {"environment": variables, "compiled": compiled}
-    return guest.run_in_guest(command, folder, **limits, **how)  # type: ignore[arg-type]
+    return guest.run_in_guest(
+        command, folder, environment=variables, timeout=LIMIT, patience=patience
+    )
 
 
 _compiling = threading.Lock()
@@ -130,20 +121,12 @@ def _checks(folder: Path) -> list[Claim]:
     return claims_of(folder / "report.xml", run.output)
 
 
-def _recorded(
-    folder: Path, loops: Mapping[str, float], compiled: Path | None = None
-) -> tuple[GuestRun, list[Path]]:
-    """Runs ``hapticbridge run`` on emulated devices in virtual time, in one guest."""
-    folder.mkdir(exist_ok=True)
-    command = [sys.executable, "-m", "usb_tiers.closed_loop", "/run/job"]
-    command += [f"{device}:{seconds:g}" for device, seconds in loops.items()]
-    ended = _in_the_guest(folder, command, compiled=compiled)
-    return ended, [folder / f"{device}.mcap" for device in loops]
-
-
 def _closed_loops(folder: Path) -> list[Claim]:
-    ended, files = _recorded(folder, LOOPS)
-    return [_closed_loop(ended, device, file) for device, file in zip(LOOPS, files, strict=True)]
+    """Runs ``hapticbridge run`` on emulated devices, in one guest."""
+    command = [sys.executable, "-m", "usb_tiers.closed_loop", "/run/job"]
+    command += [f"{device}:{seconds:g}" for device, seconds in LOOPS.items()]
+    ended = _in_the_guest(folder, command)
+    return [_closed_loop(ended, device, folder / f"{device}.mcap") for device in LOOPS]
 
 
 def _closed_loop(ended: GuestRun, device: str, file: Path) -> Claim:
@@ -159,25 +142,9 @@ def _closed_loop(ended: GuestRun, device: str, file: Path) -> Claim:
     return Claim(name, is_good, f"{note} ({report.environment})")
 
 
-def _the_same_every_time(folder: Path) -> list[Claim]:
-    name = f"a 1 kHz loop in virtual time is the same in {REPEATS} runs: to the bit, times to 1 µs"
-    _compile_ahead()
-    snapshot = snapshot_of_compiled_code(folder / "compiled")
-
-    def run(number: int) -> tuple[GuestRun, Path]:
-        place = folder / str(number)
-        mine = shutil.copytree(snapshot, place / "compiled")
-        ended, (file,) = _recorded(place, {"rawhid": REPEATED_LOOP}, mine)
-        return ended, file
-
-    is_same, note = repeated(run, REPEATS)
-    return [Claim(name, is_same, note)]
-
-
 JOBS = (
     Job("checks of the drivers", _kernel_missing, _checks),
     Job("closed loops", _kernel_missing, _closed_loops),
-    Job("1 kHz loop, repeated", _kernel_missing, _the_same_every_time),
 )
 
 
