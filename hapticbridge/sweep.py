@@ -365,10 +365,12 @@ def _parsed(line: bytes) -> dict[str, Any]:
 def _sources() -> str:
     """Returns a digest of the package's sources and shipped scenes: they decide the results."""
     digest = hashlib.blake2b(digest_size=16)
-    package = Path(__file__).parents[1]
-    for path in sorted(package.rglob("*")):
+    root = Path(__file__).parents[1]
+    # in a checkout the scenes lie beside the package, in a wheel within it
+    paths = [path for name in ("hapticbridge", "models") for path in (root / name).rglob("*")]
+    for path in sorted(paths):
         if path.suffix in {".py", ".xml"}:
-            digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
+            digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
 
 

@@ -25,7 +25,11 @@ from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceLost, HapticBridgeError
 from hapticbridge.kernel.record import TickFlag, has_flag
+from hapticbridge.recording import Recording
+from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import MAX_HANDS
+from hapticbridge.recording.reader import read_hands, read_with_attachments
+from hapticbridge.recording.writer import rewrite
 from hapticbridge.run.commands import Command, Couple, Reset, Switch
 from hapticbridge.run.hands import DeviceGroup
 from hapticbridge.whatif import what_if
@@ -290,9 +294,9 @@ def test_a_command_that_is_given_to_another_hand_is_noticed(grip: str, tmp_path:
     commanded(path, {100: COMMANDS[100]})
 
     forged = tmp_path / "forged.mcap"
-    rewrite(path, forged, lambda ticks: None, grip="right")
+    forge(path, forged, grip="right")
     assert hb.audit(forged, in_process=True).verdict == "passive"
-    rewrite(path, forged, lambda ticks: None, grip=grip)
+    forge(path, forged, grip=grip)
     assert hb.audit(forged, in_process=True).verdict == "invalid"
 
 
@@ -385,14 +389,14 @@ def test_a_changed_record_of_either_hand_is_noticed(
 ) -> None:
     path, forged = tmp_path / "run.mcap", tmp_path / "forged.mcap"
     recorded(path, seconds=0.3)
-    rewrite(path, forged, lambda ticks: None)
+    forge(path, forged)
     assert hb.audit(forged, in_process=True).verdict == "passive"
 
     def edit(ticks: list[NDArray[np.void]]) -> None:
         value = ticks[hand][field]
         value.reshape(len(value), -1)[150, 0] += change
 
-    rewrite(path, forged, edit)
+    forge(path, forged, edit)
     report = hb.audit(forged, in_process=True)
     assert report.verdict == "invalid"
     assert report.tick is None or abs(report.tick - 150) <= 1
@@ -411,7 +415,7 @@ def test_a_changed_record_of_either_hand_is_noticed(
 def test_changed_metadata_of_hands_are_noticed(value: str, message: str, tmp_path: Path) -> None:
     path, forged = tmp_path / "run.mcap", tmp_path / "forged.mcap"
     recorded(path, seconds=0.1)
-    rewrite(path, forged, lambda ticks: None, hands=value)
+    forge(path, forged, hands=value)
     report = hb.audit(forged, in_process=True)
     assert report.verdict == "invalid"
     assert message in report.reason
@@ -426,73 +430,35 @@ def test_a_recording_of_hands_with_different_ratios_of_scales_is_refused(tmp_pat
         "scale": 0.2,
         "force_scale": 1.0,
     }
-    rewrite(path, forged, lambda ticks: None, request=json.dumps(request))
+    forge(path, forged, request=json.dumps(request))
     report = hb.audit(forged, in_process=True)
     assert (report.verdict, report.certified) == ("invalid", None)
     assert "is 1 for the hand at 'left' and 5 for that at 'right'" in report.reason
 
 
-def rewrite(
+def forge(
     path: Path,
     forged: Path,
-    edit: Callable[[list[NDArray[np.void]]], None],
+    edit: Callable[[list[NDArray[np.void]]], object] = lambda ticks: None,
     *,
     grip: str = "",
     **meta: str,
 ) -> None:
-    """Writes a recording of two hands again, with its checksums made anew.
+    """Writes a recording of two hands again, changed, with its checksums made anew.
 
     Changes of a coupling are given to the hand at ``grip``.
     """
-    from hapticbridge.recording import RecordingWriter
-    from hapticbridge.recording.format import Attachment
-    from hapticbridge.recording.reader import open_hands
-
-    first, second = open_hands(path)
-    ticks = [np.concatenate(list(each.blocks())) for each in (first, second)]
+    recording, files = read_with_attachments(path, 0)
+    ticks = [hand.ticks.copy() for hand in read_hands(path)]
     edit(ticks)
-    files = [Attachment(n, "application/octet-stream", d) for n, d in first.attachments.items()]
-    writer = RecordingWriter(forged, first.meta, files, int(first.meta["epoch_ns"]))
-    events = [dict(event) for event in first.events]
-    for event in events:
-        if event["event"] == "coupling":
-            event["grip"] = grip
-    writer.write_event(events[0], events[0]["time_ns"])
-    for hand, rows in enumerate(ticks):
-        writer.write_ticks(rows, hand)
-    for event in events[1:]:
-        writer.write_event(event, event["time_ns"])
-    writer.close()
-    if meta:
-        change_metadata(forged, first, files, ticks, meta)
-
-
-def change_metadata(
-    forged: Path,
-    first: Any,
-    files: list[Any],
-    ticks: list[NDArray[np.void]],
-    meta: dict[str, str],
-) -> None:
-    """Writes both hands' records under other metadata of the hands."""
-    from hapticbridge.recording import RecordingWriter
-    from hapticbridge.recording import format as layout
-
-    class Writer(RecordingWriter):
-        """Writer whose number of hands is two, whatever the metadata are."""
-
-    monkey = pytest.MonkeyPatch()
-    monkey.setattr(layout, "further_hands", lambda _: [{}])
-    with monkey.context():
-        writer = Writer(forged, first.meta | meta, files, int(first.meta["epoch_ns"]))
-    monkey.undo()
-    events = list(first.events)
-    writer.write_event(events[0], events[0]["time_ns"])
-    for hand, rows in enumerate(ticks):
-        writer.write_ticks(rows, hand)
-    for event in events[1:]:
-        writer.write_event(event, event["time_ns"])
-    writer.close()
+    events = [
+        {**event, "grip": grip} if event["event"] == "coupling" else event
+        for event in recording.events
+    ]
+    changed = Recording(**{**vars(recording), "meta": recording.meta | meta})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(layout, "further_hands", lambda _: [{}])  # two, whatever the metadata are
+        rewrite(changed, files, forged, ticks, events)
 
 
 @pytest.mark.parametrize("most", [0, 1 << 17], ids=["from the file", "in memory"])

@@ -14,7 +14,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.lab.maps import contact
 from hapticbridge.lab.maps import contact_rigs as rigs
-from hapticbridge.lab.maps.base import loop_in
+from hapticbridge.lab.maps.base import PERIOD, loop_in
 from hapticbridge.lab.maps.contact_rigs import Case, ContactRun, Treatment, run_cases
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene.contacts import SUGGESTED, contact_numbers
@@ -22,7 +22,7 @@ from hapticbridge.scene.contacts import SUGGESTED, contact_numbers
 LIGHT = rigs.WORST
 """A peg of 30 g without friction in a random hand: the hardest case of the map."""
 
-DAMPED = Treatment(solref=(SUGGESTED[0] * rigs.PERIOD, SUGGESTED[1]))
+DAMPED = Treatment(solref=(SUGGESTED[0] * PERIOD, SUGGESTED[1]))
 ON_WALL = [Case("wall", 2000.0, mass, 0.0, hand) for mass in (0.01, 0.05, 0.2) for hand in (-1, -2)]
 
 
@@ -165,8 +165,8 @@ def wall_depths(treatment: Treatment) -> Any:
 def test_a_damped_contact_comes_back_with_the_relaxation_time_that_the_rule_is_about() -> None:
     depth = wall_depths(DAMPED)
     left = depth[[1650, 1750]] - depth[-1]
-    numbers = contact_numbers(DAMPED.solref, rigs.SHIPPED_SOLIMP, rigs.PERIOD)
-    relaxation = numbers.relaxation * rigs.PERIOD
+    numbers = contact_numbers(DAMPED.solref, rigs.SHIPPED_SOLIMP, PERIOD)
+    relaxation = numbers.relaxation * PERIOD
     assert 0.1 / np.log(left[0] / left[1]) == pytest.approx(relaxation, rel=0.1)
 
 

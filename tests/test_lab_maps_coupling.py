@@ -17,13 +17,14 @@ from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.lab.maps import coupling
 from hapticbridge.lab.maps.base import (
+    PERIOD,
     Point,
     free_tool_and_wall,
     limit_by_6,
     needed_by_6,
     used_damping,
 )
-from hapticbridge.lab.maps.coupling import DEVICE_DAMPING, PATH, PERIOD, evaluate
+from hapticbridge.lab.maps.coupling import DEVICE_DAMPING, PATH, evaluate
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
 
@@ -47,10 +48,10 @@ def test_worst_hand_on_a_wall_finds_the_bound_within_a_percent(damping: float) -
 def test_the_bound_of_a_method_is_that_of_the_coupling_it_uses(method: str) -> None:
     for k in (500.0, 1500.0, 6000.0):
         used = METHODS[method].law_coupling(Coupling(k, 1.2, 1.0, 0.0), PERIOD)
-        assert used_damping(method, k, 1.2, PERIOD) == pytest.approx(used.damping)
-        assert needed_by_6(method, k, 1.2, PERIOD) == pytest.approx(minimum_damping(used, PERIOD))
-    limit = limit_by_6(method, DEVICE_DAMPING, PERIOD, 1.2)
-    assert needed_by_6(method, limit, 1.2, PERIOD) == pytest.approx(DEVICE_DAMPING)
+        assert used_damping(method, k, 1.2) == pytest.approx(used.damping)
+        assert needed_by_6(method, k, 1.2) == pytest.approx(minimum_damping(used, PERIOD))
+    limit = limit_by_6(method, DEVICE_DAMPING, 1.2)
+    assert needed_by_6(method, limit, 1.2) == pytest.approx(DEVICE_DAMPING)
 
 
 def test_coupling_that_the_device_cannot_bear_is_unstable_though_the_scene_is_passive() -> None:

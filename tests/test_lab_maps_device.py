@@ -9,11 +9,11 @@ import pytest
 from map_runs import boundary_of
 
 from hapticbridge.lab.maps import device
+from hapticbridge.lab.maps.base import PERIOD
 from hapticbridge.lab.maps.device import (
     DAMPERS,
     LARGE,
     METHODS_SHOWN,
-    PERIOD,
     QUANTUM,
     RESOLUTION,
     STIFFNESS,

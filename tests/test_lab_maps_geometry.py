@@ -10,7 +10,7 @@ import pytest
 from map_runs import boundary_of
 
 from hapticbridge.lab.maps import geometry
-from hapticbridge.lab.maps.base import Point
+from hapticbridge.lab.maps.base import PERIOD, Point
 from hapticbridge.scene import load_scene
 
 
@@ -56,7 +56,7 @@ def test_in_its_hole_lossless_is_implicit_with_the_damper_that_it_uses(
     stiffness: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = geometry.torque(geometry.run("lossless", 0.1, stiffness))
-    damping = max(geometry.ROTATIONAL_DAMPING - stiffness * geometry.PERIOD / 2, 0.0)
+    damping = max(geometry.ROTATIONAL_DAMPING - stiffness * PERIOD / 2, 0.0)
     assert not np.allclose(
         found, geometry.torque(geometry.run("implicit", 0.1, stiffness)), rtol=1e-3
     )

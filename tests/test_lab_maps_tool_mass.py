@@ -11,7 +11,7 @@ from map_runs import boundary_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.maps import tool_mass
-from hapticbridge.lab.maps.base import Point
+from hapticbridge.lab.maps.base import PERIOD, Point
 from hapticbridge.theory.sampled_loop import SampledLoop
 from hapticbridge.theory.virtual_mass import Integrator, environment_minimum_damping, minimum_mass
 
@@ -41,7 +41,7 @@ def test_the_theory_here_is_that_of_the_passivity_package(method: str) -> None:
 def test_behind_a_handle_held_still_a_method_fails_where_theory_says(
     method: str, stiffness: float
 ) -> None:
-    least = tool_mass.min_mass(method, stiffness, tool_mass.DAMPING, tool_mass.PERIOD)
+    least = tool_mass.min_mass(method, stiffness, tool_mass.DAMPING, PERIOD)
     failed = tool_mass.held_still(method, stiffness, 0.97 * least)
     assert not failed.is_stable
     assert failed.environment == "active"  # the ledger's port: what lies behind the coupling
@@ -76,7 +76,7 @@ def test_implicit_fails_at_no_mass() -> None:
 
 @pytest.mark.parametrize("method", ["compensated", "lossless"])
 def test_without_the_lag_no_mass_fails_up_to_twice_b_over_t(method: str) -> None:
-    limit = 2 * tool_mass.DEVICE_DAMPING / tool_mass.PERIOD
+    limit = 2 * tool_mass.DEVICE_DAMPING / PERIOD
     assert tool_mass.held_still(method, 0.98 * limit, 1e-3).is_stable
     for mass in (2e-3, 5.0):
         assert tool_mass.worst_hand(method, 0.98 * limit, mass).is_stable
@@ -86,7 +86,7 @@ def test_without_the_lag_no_mass_fails_up_to_twice_b_over_t(method: str) -> None
 
 
 def test_a_light_tool_is_no_help_to_the_lossless_coupling() -> None:
-    limit = 2 * tool_mass.DEVICE_DAMPING / tool_mass.PERIOD
+    limit = 2 * tool_mass.DEVICE_DAMPING / PERIOD
     assert not tool_mass.worst_hand("lossless", 1.02 * limit, 2e-3).is_stable
     assert tool_mass.worst_hand("compensated", 1.02 * limit, 2e-3).is_stable
 
@@ -99,7 +99,7 @@ def test_a_heavy_tool_on_a_soft_coupling_decays() -> None:
 def test_implicitfast_uses_up_the_slack_where_the_spring_outweighs_the_damper() -> None:
     # E_k is K δx² and the slack ½ (K + B/T) δx², whatever the mass
     for stiffness, verdict in ((4000.0, "within slack"), (6000.0, "active")):
-        share = 2 * stiffness / (stiffness + tool_mass.DAMPING / tool_mass.PERIOD)
+        share = 2 * stiffness / (stiffness + tool_mass.DAMPING / PERIOD)
         point: Point = {"what": "cell", "method": "implicitfast"}
         point |= {"stiffness": stiffness, "mass": 0.01}
         outcome = tool_mass.evaluate(point)

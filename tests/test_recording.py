@@ -601,20 +601,25 @@ def test_chunk_that_claims_exabytes_is_not_allocated(whole: Path, tmp_path: Path
     assert any("is not read" in problem for problem in changed(tmp_path / "a.mcap", data).problems)
 
 
-@pytest.mark.parametrize("states_size", [True, False])
-def test_an_empty_chunk_is_no_damage(tmp_path: Path, *, states_size: bool) -> None:
-    """A frame of Zstandard may leave out the size of its content."""
-    packed = zstandard.ZstdCompressor(write_content_size=states_size).compress(b"")
-    chunk = struct.pack("<QQQII4sQ", 0, 0, 0, 0, 4, b"zstd", len(packed)) + packed
+def read_back(path: Path, chunk: bytes) -> tuple[Block, list[str]]:
+    """Returns the only block of a file with one chunk, and what is wrong with the file."""
     end = struct.pack("<BQI", Opcode.DATA_END, 4, 0)
     end += struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0)
-    path = tmp_path / "empty.mcap"
     path.write_bytes(MAGIC + struct.pack("<BQ", Opcode.CHUNK, len(chunk)) + chunk + end + MAGIC)
     with FileBytes(path) as data:
         container = Container(data)
         (block,) = container.records()
     assert isinstance(block, Block)
-    assert (container.problems, block.data) == ([], b"")
+    return block, container.problems
+
+
+@pytest.mark.parametrize("states_size", [True, False])
+def test_an_empty_chunk_is_no_damage(tmp_path: Path, *, states_size: bool) -> None:
+    """A frame of Zstandard may leave out the size of its content."""
+    packed = zstandard.ZstdCompressor(write_content_size=states_size).compress(b"")
+    chunk = struct.pack("<QQQII4sQ", 0, 0, 0, 0, 4, b"zstd", len(packed)) + packed
+    block, problems = read_back(tmp_path / "empty.mcap", chunk)
+    assert (problems, block.data) == ([], b"")
 
 
 @pytest.mark.parametrize(
@@ -630,13 +635,6 @@ def test_a_chunk_without_a_checksum_is_no_damage(
     tmp_path: Path, size: int, crc: int, fault: str
 ) -> None:
     """MCAP writes 0 where none was computed."""
-    path = tmp_path / "chunk.mcap"
     chunk = struct.pack("<QQQII0sQ", 0, 0, size, crc, 0, b"", 4) + b"tick"
-    end = struct.pack("<BQI", Opcode.DATA_END, 4, 0)
-    end += struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0)
-    path.write_bytes(MAGIC + struct.pack("<BQ", Opcode.CHUNK, len(chunk)) + chunk + end + MAGIC)
-    with FileBytes(path) as data:
-        container = Container(data)
-        (block,) = container.records()
-    assert isinstance(block, Block)
+    block, _ = read_back(tmp_path / "chunk.mcap", chunk)
     assert (block.fault, block.data) == (fault, b"tick")

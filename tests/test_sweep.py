@@ -24,6 +24,7 @@ import sweep_functions as functions
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+import hapticbridge
 from hapticbridge.errors import StudyError
 from hapticbridge.files import install_command
 from hapticbridge.signals import holding_interrupts
@@ -356,6 +357,24 @@ def test_a_file_of_another_function_or_version_is_refused(tmp_path: Path) -> Non
     path.write_text("[]")
     with pytest.raises(StudyError, match="holds a sweep of None"):
         sweep(functions.bound, POINTS, results=path, workers=1)
+
+
+def test_a_file_belongs_to_the_packages_sources_and_not_to_those_beside_it(tmp_path: Path) -> None:
+    """A package that is installed lies in a folder of many others."""
+    (tmp_path / "hapticbridge").symlink_to(Path(hapticbridge.__file__).parent)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    first: list[str] = []
+    for other in ("value = 1", "value = 2"):
+        (tmp_path / "other.py").write_text(other)
+        kept = tmp_path / f"kept{len(first)}"
+        program = (
+            "from sweep_functions import bound, grid, sweep; "
+            f"sweep(bound, grid(stiffness=[1.0], damping=[0.1]), results={str(kept)!r}, workers=1)"
+        )
+        command = [sys.executable, "-c", program]
+        subprocess.run(command, check=True, env=environment, cwd=tmp_path)
+        first.append(kept.read_text().splitlines()[0])
+    assert first[0] == first[1]
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from hapticbridge.demand.loop_setting import Lag, delay_ticks
 from hapticbridge.demand.methods import RunCoupling, default_method
 from hapticbridge.demand.plots import draw_z_width
 from hapticbridge.device import AXES, DeviceInfo, open_device
-from hapticbridge.device.base import checked_close
+from hapticbridge.device.base import checked
 from hapticbridge.device.profile import Profile, own_folder
 from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.files import NO_HOME, writing
@@ -288,7 +288,7 @@ class Identify:
                     ),
                 )
         finally:
-            checked_close(device)()
+            checked(device).close()
         z = safe_width(result)
         profile = measured_profile(
             result,

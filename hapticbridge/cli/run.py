@@ -38,7 +38,7 @@ from hapticbridge.demand.methods import RunCoupling, default_method, unsuited_re
 from hapticbridge.demand.pulse import tap_words
 from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
-from hapticbridge.device.base import checked_close
+from hapticbridge.device.base import checked
 from hapticbridge.device.mouse import MouseDevice
 from hapticbridge.device.registry import is_device
 from hapticbridge.device.trajectory import DEFAULT_SECONDS
@@ -494,7 +494,7 @@ class Run:
                 self._refuse_grip_scale()
             device = device_for(scene, self.device, notify, joint)
             # what is refused from here on must not leave it claimed
-            stack.callback(checked_close(device))
+            stack.callback(checked(device).close)
             chosen = self._for_devices([device.info])
             if joint and self.grip_axis is None and device.info.grip_axis is None:
                 notify(f"'{device.info.name}' has no grip axis, so joint '{joint}' moves freely")

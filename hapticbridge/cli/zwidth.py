@@ -31,7 +31,7 @@ from hapticbridge.demand.plots import (
     recommended_coupling,
 )
 from hapticbridge.device import AXES, Device, DeviceInfo, open_device
-from hapticbridge.device.base import USUAL_FORCE_LIMIT, checked_close
+from hapticbridge.device.base import USUAL_FORCE_LIMIT, checked
 from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.identify.z_width import SHARES, MeasuredWidth, measure_width, measured_points
 from hapticbridge.kernel.parameters import whole_ticks
@@ -121,7 +121,7 @@ class Zwidth:
                     measured = measure_width(device, clock, z, axis=axis, progress=show)
         finally:
             if device is not None:
-                checked_close(device)()
+                checked(device).close()
         # the run command has no low-pass to offer, and without it this corner is not passive
         coupling = recommended(z)
         command = next_command(coupling.stiffness, coupling.damping, self.rate)
@@ -148,7 +148,7 @@ class Zwidth:
         device = open_device(spec, notify=notify)
         here = [name for name in AXES[:3] if name in device.info.axes]
         if device.info.is_prescribed or axis not in here:
-            checked_close(device)()
+            checked(device).close()
             if device.info.is_prescribed or not here:
                 raise HapticBridgeError(
                     f"--measure {spec}: no force moves this device along x, y or z, so it has no "
@@ -461,7 +461,7 @@ class Bound:
         if self.device is None:
             return None
         device = open_device(self.device, notify=notify)
-        checked_close(device)()
+        checked(device).close()
         info = device.info
         if info.is_prescribed or not info.moves:
             raise HapticBridgeError(

@@ -435,33 +435,43 @@ def checked(device: Device) -> Device:
 
 
 class _Checked:
+    """Device of another package: whatever it raises is a ``DeviceError`` that names the call."""
+
     def __init__(self, device: Device) -> None:
-        self.info = device.info
-        self.start, self.read = checked_start(device), checked_read(device)
-        self.write, self.close = checked_write(device), checked_close(device)
+        self._device, self.info = device, device.info
+        self._of = f"device '{device.info.name}'"
 
-
-def checked_start(device: Device) -> Callable[[float], NDArray[np.void]]:
-    """Returns the device's ``start``; for a device of another package, one that checks its answer.
-
-    Raises:
-        DeviceError: By the returned function, if the answer is not an array of samples, or the
-            device raises anything.
-    """
-    if _is_ours(device):
-        return device.start
-
-    def checked(period: float) -> NDArray[np.void]:
-        with telling(f"device '{device.info.name}': start"):
-            sample = device.start(period)
+    def start(self, period: float) -> NDArray[np.void]:
+        with telling(f"{self._of}: start"):
+            sample = self._device.start(period)
         if not isinstance(sample, np.ndarray) or sample.dtype != SAMPLE_DTYPE or sample.ndim != 1:
             raise DeviceError(
-                f"device '{device.info.name}': start returned {shown(sample)}; it must be an array "
-                "of SAMPLE_DTYPE with the shape (1,), or (2,) with a grip axis"
+                f"{self._of}: start returned {shown(sample)}; it must be an array of SAMPLE_DTYPE "
+                "with the shape (1,), or (2,) with a grip axis"
             )
         return sample
 
-    return checked
+    def read(self, sample: NDArray[np.void]) -> int:
+        try:  # as telling(), without an object per tick
+            flags = self._device.read(sample)
+        except Exception as error:
+            raise _as_device_error(f"{self._of}: read", error) from error
+        if not isinstance(flags, int | np.integer):
+            raise DeviceError(
+                f"{self._of}: read returned {shown(flags)}; it must be 0 for a new sample, or "
+                "TickFlag.STALE_SAMPLE"
+            )
+        return int(flags)
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        try:
+            self._device.write(wrench)
+        except Exception as error:
+            raise _as_device_error(f"{self._of}: write", error) from error
+
+    def close(self) -> None:
+        with telling(f"{self._of}: close"):
+            self._device.close()
 
 
 def device_fault(device: object) -> str:
@@ -473,65 +483,3 @@ def device_fault(device: object) -> str:
     calls = ("start", "read", "write", "close")
     lacking = [call for call in calls if not callable(getattr(device, call, None))]
     return f"lacks {', '.join(lacking)}" if lacking else ""
-
-
-def checked_close(device: Device) -> Callable[[], None]:
-    """Returns the device's ``close``; for a device of another package, one whose errors are told.
-
-    Raises:
-        DeviceError: By the returned function, if the device raises anything.
-    """
-    if _is_ours(device):
-        return device.close
-
-    def checked() -> None:
-        with telling(f"device '{device.info.name}': close"):
-            device.close()
-
-    return checked
-
-
-def checked_write(device: Device) -> Callable[[NDArray[np.float64]], None]:
-    """Returns the device's ``write``; for a device of another package, one whose errors are told.
-
-    Raises:
-        DeviceError: By the returned function, if the device raises anything.
-    """
-    if _is_ours(device):
-        return device.write
-    write, call = device.write, f"device '{device.info.name}': write"
-
-    def checked(wrench: NDArray[np.float64]) -> None:
-        try:  # as telling(), without an object per tick
-            write(wrench)
-        except Exception as error:
-            raise _as_device_error(call, error) from error
-
-    return checked
-
-
-def checked_read(device: Device) -> Callable[[NDArray[np.void]], int]:
-    """Returns the device's ``read``; for a device of another package, one that checks its answers.
-
-    Raises:
-        DeviceError: By the returned function, if the answer is not a whole number, such as None, or
-            the device raises anything.
-    """
-    if _is_ours(device):
-        return device.read
-    read, name = device.read, device.info.name
-    call = f"device '{name}': read"
-
-    def checked(sample: NDArray[np.void]) -> int:
-        try:
-            flags = read(sample)
-        except Exception as error:
-            raise _as_device_error(call, error) from error
-        if not isinstance(flags, int | np.integer):
-            raise DeviceError(
-                f"device '{name}': read returned {shown(flags)}; it must be 0 for a new sample, or "
-                "TickFlag.STALE_SAMPLE"
-            )
-        return int(flags)
-
-    return checked

@@ -30,7 +30,7 @@ from hapticbridge.arguments import number_from
 from hapticbridge.device.base import (
     Device,
     calling_on_error,
-    checked_close,
+    checked,
     device_fault,
     telling,
 )
@@ -323,7 +323,7 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
             requested.pop("profile", None)
         profile = None if profile_option in (None, "none") else profile_named(str(profile_option))
         device = driver.open(requested, notify)
-        with calling_on_error(checked_close(device)):
+        with calling_on_error(checked(device).close):
             if profile_option is None:
                 model = device.info.name
                 profile = profile_of(name, device.info.serial, model)

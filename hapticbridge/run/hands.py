@@ -21,7 +21,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.methods import METHODS, default_method, method_named
 from hapticbridge.device import Device, DeviceInfo
-from hapticbridge.device.base import checked_close, checked_read, checked_start, checked_write
+from hapticbridge.device.base import checked
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
 from hapticbridge.kernel.codes import Grip
 from hapticbridge.recording.format import MAX_HANDS
@@ -346,11 +346,12 @@ class DeviceGroup:
             duration=max(known) if len(known) == len(durations) else None,
         )
         self.external_flags: NDArray[np.int64] = np.zeros(sum(counts), np.int64)
-        self._devices, self._counts = tuple(devices), tuple(counts)
-        self._reads = tuple(checked_read(device) for device in devices)
-        self._writes = tuple(checked_write(device) for device in devices)
         ends = np.cumsum(counts).tolist()
-        self._parts = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
+        # each device with the number of its hands, and their place among all
+        self._devices = [
+            (checked(device), count, slice(end - count, end))
+            for device, count, end in zip(devices, counts, ends, strict=True)
+        ]
         # taking an array apart costs as much as reading a device, so it is done once per array
         self._sample: object = None
         self._wrench: object = None
@@ -359,8 +360,7 @@ class DeviceGroup:
 
     def real_ones(self) -> tuple[DeviceGroup, list[int]]:
         """Returns the real devices, of which there must be one, and the numbers of their hands."""
-        parts = zip(self._devices, self._counts, self._parts, strict=True)
-        real = [(device, count, part) for device, count, part in parts if device.info.is_real]
+        real = [each for each in self._devices if each[0].info.is_real]
         hands = [hand for *_, part in real for hand in range(part.start, part.stop)]
         return DeviceGroup([each[0] for each in real], [each[1] for each in real]), hands
 
@@ -370,8 +370,7 @@ class DeviceGroup:
         Raises:
             DeviceError: One of them cannot run at this period.
         """
-        starts = zip(self._devices, self._counts, strict=True)
-        return np.concatenate([checked_start(device)(period)[:count] for device, count in starts])
+        return np.concatenate([device.start(period)[:count] for device, count, _ in self._devices])
 
     def read(self, sample: NDArray[np.void]) -> int:
         """Reads every device's newest sample; returns 0, since each hand has flags of its own.
@@ -382,8 +381,13 @@ class DeviceGroup:
         if sample is not self._sample:
             self._sample = sample
             self._reading = [
-                (part.start, read, sample["buttons"][part] if count > 1 else None, sample[part])
-                for read, part, count in zip(self._reads, self._parts, self._counts, strict=True)
+                (
+                    part.start,
+                    device.read,
+                    sample["buttons"][part] if count > 1 else None,
+                    sample[part],
+                )
+                for device, count, part in self._devices
             ]
         flags = self.external_flags
         for hand, read, buttons, own in self._reading:
@@ -402,11 +406,11 @@ class DeviceGroup:
         """
         if wrench is not self._wrench:
             self._wrench = wrench
-            each = np.broadcast_to(wrench, (self._parts[-1].stop, 6))
+            each = np.broadcast_to(wrench, (self.external_flags.size, 6))
             # a device with one hand gets its wrench, (6,)
             self._writing = [
-                (write, each[part if count > 1 else part.start])
-                for write, part, count in zip(self._writes, self._parts, self._counts, strict=True)
+                (device.write, each[part if count > 1 else part.start])
+                for device, count, part in self._devices
             ]
         failed: DeviceError | None = None
         for write, own in self._writing:
@@ -420,5 +424,5 @@ class DeviceGroup:
     def close(self) -> None:
         """Closes every device."""
         with ExitStack() as stack:
-            for device in self._devices:
-                stack.callback(checked_close(device))
+            for device, *_ in self._devices:
+                stack.callback(device.close)

@@ -33,7 +33,7 @@ from hapticbridge.demand.probe import EVENT as PROBE_EVENT
 from hapticbridge.demand.probe import Probed, ProbedHand, probe_devices
 from hapticbridge.demand.trip import BY_TRIP, Trip, TripCode
 from hapticbridge.device import Device
-from hapticbridge.device.base import checked_close, checked_read, checked_start, checked_write
+from hapticbridge.device.base import checked
 from hapticbridge.device.own_loop import LoopDevice
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.kernel.codes import OK, RING_FULL
@@ -150,18 +150,18 @@ class ProbedPort:
     """
 
     def __init__(self, device: Device) -> None:
-        self._device, self._read, self._write = device, checked_read(device), checked_write(device)
+        self._device = checked(device)
 
     def read(self, sample: NDArray[np.void]) -> Sequence[int]:
         """Reads the newest samples; returns the flags of each."""
-        flags = self._read(sample)
+        flags = self._device.read(sample)
         if isinstance(self._device, DeviceGroup):
             return list(self._device.external_flags)
         return [flags]
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         """Commands a wrench per hand, (n, 6)."""
-        self._write(wrench if isinstance(self._device, DeviceGroup) else wrench[0])
+        self._device.write(wrench if isinstance(self._device, DeviceGroup) else wrench[0])
 
 
 class Port(NamedTuple):
@@ -305,6 +305,7 @@ class Session:
         self._request, self._setups = request, tuple(setups)
         self.setup = setups[0]
         self.device, self.clock, self.output, self.stop = device, clock, output, stop
+        self._calls = checked(device)
         self.tick = self.overruns = self.skipped = 0
         self.end, self._is_timed, self._slept = -1, False, 0
         self._start_potential = 0.0
@@ -324,7 +325,7 @@ class Session:
             now=lambda: 1e-9 * clock.now(),
         )
         with ExitStack() as resources:
-            resources.callback(checked_close(device))  # ``_open`` says why it is called twice
+            resources.callback(self._calls.close)  # ``_open`` says why it is called twice
             self._open(resources)
             resources.callback(self.command_zero_force)
             self._resources = resources.pop_all()
@@ -370,8 +371,8 @@ class Session:
         if setup.is_realtime:
             self._grants = resources.enter_context(memory_at_rest())
         resources.callback(self._close_scene)
-        resources.callback(checked_close(self.device))
-        self.samples[:] = checked_start(self.device)(setup.period)[: self.samples.size]
+        resources.callback(self._calls.close)
+        self.samples[:] = self._calls.start(setup.period)[: self.samples.size]
         for each, own in zip(self._setups, self._samples(), strict=True):
             refuse_implausible_pose(each.info, own)
         self.hand_parameters = self._parameters(effective)
@@ -397,7 +398,7 @@ class Session:
 
     def _open_port(self, bound: BoundKernel) -> None:
         """Makes the port to the device, or to a loop of its own."""
-        self._port = Port(checked_read(self.device), checked_write(self.device))
+        self._port = Port(self._calls.read, self._calls.write)
         self._own_loop: OwnLoop | None = None
         if self.parameters.is_apart:
             device = cast(LoopDevice, self.device)
@@ -732,7 +733,7 @@ class Session:
     def command_zero_force(self) -> Trip | None:
         """Commands zero force; returns a trip if that failed, or None."""
         try:
-            checked_write(self.device)(_NO_FORCE)
+            self._calls.write(_NO_FORCE)
         except DeviceError as error:
             return Trip(TripCode.ZERO_FORCE, self.tick, detail=str(error))
         return None

@@ -25,6 +25,7 @@ from hapticbridge.arguments import number_from
 from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.codes import Grip
 from hapticbridge.scene.compile import reset, unfused_model
+from hapticbridge.scene.physics import matrix_of
 
 MAX_OFFERED = 4
 """Number of grips that a refusal names. More would make its sentence too long to read."""
@@ -144,11 +145,10 @@ def _rim(model: mujoco.MjModel, body_id: int) -> NDArray[np.float64] | None:
         return None
     largest = geoms[np.argmax(model.geom_rbound[geoms])]
     axis = model.jnt_axis[model.body_jntadr[body_id]]
-    across, matrix = np.eye(3)[np.argmin(np.abs(axis))], np.zeros(9)
+    across = np.eye(3)[np.argmin(np.abs(axis))]
     across = across - axis * (axis @ across)
     across /= np.linalg.norm(across)
-    mujoco.mju_quat2Mat(matrix, model.geom_quat[largest])
-    reach = np.abs(matrix.reshape(3, 3).T @ across) @ model.geom_aabb[largest, 3:]
+    reach = np.abs(matrix_of(model.geom_quat[largest]).T @ across) @ model.geom_aabb[largest, 3:]
     return np.asarray(_centre(model, body_id) + reach * across) if reach > 0.0 else None
 
 

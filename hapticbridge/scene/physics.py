@@ -29,19 +29,20 @@ def matrix_of(quaternion: ArrayLike) -> Array:
     return matrix.reshape(3, 3)
 
 
-def quaternion_of(matrix: Array) -> Array:
+def quaternion_of(matrix: ArrayLike) -> Array:
     """Returns the unit quaternion (w, x, y, z) of a rotation matrix."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - 0.3 s, and no run needs it
-
-    return np.asarray(Rotation.from_matrix(matrix).as_quat(scalar_first=True))
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, np.asarray(matrix, dtype=np.float64).ravel())
+    return quaternion
 
 
 def rotation_vector(start: ArrayLike, now: ArrayLike) -> Array:
-    """Returns the rotation vector in rad from one orientation to another."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - 0.3 s, and no run needs it
-
-    before, after = (Rotation.from_quat(each, scalar_first=True) for each in (start, now))
-    return np.asarray((after * before.inv()).as_rotvec())
+    """Returns the rotation vector in rad from one orientation to another, in the world's axes."""
+    back, turn, vector = np.zeros(4), np.zeros(4), np.zeros(3)
+    mujoco.mju_negQuat(back, np.asarray(start, dtype=np.float64))
+    mujoco.mju_mulQuat(turn, np.asarray(now, dtype=np.float64), back)
+    mujoco.mju_quat2Vel(vector, turn, 1.0)
+    return vector
 
 
 def pose_in(frame: Array, pose: Array) -> Array:

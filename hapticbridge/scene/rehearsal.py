@@ -36,6 +36,7 @@ from hapticbridge.kernel.state import BoundKernel, Place
 from hapticbridge.scene import Scene
 from hapticbridge.scene.compile import clause
 from hapticbridge.scene.handle import PROBE
+from hapticbridge.scene.physics import quaternion_of
 
 AT_REST = 1e-6
 """Largest acceleration in m/s² or rad/s² of a tool that rests without a hand. Rounding leaves less;
@@ -314,8 +315,7 @@ def toppling_force(scene: Scene, parameters: RunParameters) -> float:
         return 0.0
     mujoco.mj_integratePos(model, data.qpos, mode, TIPPED / way)
     mujoco.mj_kinematics(model, data)
-    orientation = np.zeros(4)
-    mujoco.mju_mat2Quat(orientation, data.site_xmat[site])
+    orientation = quaternion_of(data.site_xmat[site])
     handle = (*data.site_xpos[site].tolist(), *orientation.tolist())
     wrenches = np.array(list(rehearsal.steps(handle, HOLDING_STEPS)))
     return float(np.linalg.norm(wrenches.reshape(-1, 6)[:, :3].mean(axis=0)))  # it swings

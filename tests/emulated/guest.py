@@ -92,27 +92,21 @@ def run_in_guest(
     folder: Path,
     *,
     environment: Mapping[str, str],
-    is_virtual: bool,
     timeout: float = 120.0,
     patience: float | None = None,
-    compiled: Path | None = None,
 ) -> GuestRun:
     """Runs a command as the only job of a freshly booted guest.
 
-    Virtual time passes by 256 ns with each reading of the clock too, or who waits for it by reading
-    would wait for ever. So what a program does before shifts what it does after: two runs are the
-    same only if they also find the same byte code and machine code, or both find none.
+    Time is virtual: it passes only while everything in the guest waits, so that nothing depends on
+    this machine's speed. It passes by 256 ns with each reading of the clock too, or who waits for
+    it by reading would wait for ever. The guest writes to this machine's folder of compiled code.
 
     Args:
         command: The command and its arguments.
         folder: An existing folder, ``/run/job`` in the guest: what it writes there stays.
         environment: Variables for the command.
-        is_virtual: Time passes only while everything in the guest waits, so that nothing depends on
-            this machine's speed.
         timeout: In s of this machine's time.
         patience: Likewise: for how long it may print nothing; None: for as long as it likes.
-        compiled: Folder of compiled functions, to which it may write; None: this machine's, shared
-            with whoever compiles meanwhile.
     """
     program = kernel()
     if program is None:
@@ -121,10 +115,10 @@ def run_in_guest(
     (folder / "command").write_text("\n".join([*exports, shlex.join(command)]) + "\n")
     (folder / "status").unlink(missing_ok=True)
     root = "root=/dev/root rootfstype=hostfs rootflags=/ ro quiet con=null con0=null,fd:1 ssl=null"
-    job = [f"job={folder}", f"compiled={compiled or _compiled_code()}"]
+    job = [f"job={folder}", f"compiled={_compiled_code()}"]
     init = f"init={CHECKOUT / 'tests/uml/init'}"
-    arguments = [str(program), f"mem={_MEMORY_MIB}M", *root.split(), init, *job]
-    arguments += ["time-travel=inf-cpu"] if is_virtual else []
+    virtual_time = "time-travel=inf-cpu"
+    arguments = [str(program), f"mem={_MEMORY_MIB}M", *root.split(), init, *job, virtual_time]
     start = time.monotonic()
     # a group of its own: the guest's programs are processes of the host, and end with it
     guest = subprocess.Popen(

@@ -1,38 +1,28 @@
-"""Jobs of tiers B and C: the commands, the needs and the findings of each.
+"""Jobs in a User-Mode Linux, real libraries on a real kernel: their commands, needs and findings.
 
-Tier A, in process, is the project's ordinary tests. Tier B is real hidapi and libusb under
-umockdev's preload library. Tier C is a User-Mode Linux: real libraries on a real kernel. Run as a
-program, it runs all jobs and prints what ran and what was skipped and why.
+The project's ordinary tests drive the same emulated devices in process. Run as a program, it runs
+all jobs and prints what ran and what was skipped and why.
 """
 
 from __future__ import annotations
 
-import ctypes
 import os
-import shutil
-import subprocess
 import sys
 import tempfile
 import threading
 import time
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 import hapticbridge as hb
 from emulated import guest
-from emulated.compile_ahead import compile_ahead, snapshot_of_compiled_code
+from emulated.compile_ahead import compile_ahead
 from emulated.guest import CHECKOUT, NO_KERNEL, GuestRun, kernel
-from emulated.parting import repeated
-from emulated.umock_sysfs import make_test_bed
-
-PRELOAD = "libumockdev-preload.so.0"
-NO_UMOCKDEV = "no umockdev; 'apt-get install umockdev libusb-1.0-0' brings it"
 
 CHECKS = CHECKOUT / "tests/usb_tiers"
 LIMIT = 600.0
@@ -41,9 +31,6 @@ LIMIT = 600.0
 LOOPS = {"falcon": 3.0, "rawhid": 3.0, "pid": 4.0}
 """Closed loops, and the virtual time in s of each: a run begins some 2 s into the hand's path, and
 the home-made device's peg touches its hole 2 s later."""
-
-REPEATS, REPEATED_LOOP = 2, 1.0
-"""Number of runs that must be equal to the bit, and the length of each in s of virtual time."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +50,10 @@ class Claim:
 
 @dataclass(frozen=True)
 class Job:
-    """Something to run in a tier.
+    """Something to run in a guest.
 
     Attributes:
-        name: Its tier and what it does there.
+        name: What it does.
         missing: Says what this machine lacks for it, None where nothing.
         run: Runs it, with an empty folder to write to.
     """
@@ -76,25 +63,17 @@ class Job:
     run: Callable[[Path], list[Claim]]
 
 
-def _umockdev_missing() -> str | None:
-    try:
-        ctypes.CDLL(PRELOAD)
-    except OSError:
-        return NO_UMOCKDEV
-    return None
-
-
 def _kernel_missing() -> str | None:
     return None if kernel() is not None else NO_KERNEL
 
 
-def _pytest(report: str, files: str = "check_*.py", only: str = "test") -> list[str]:
-    """Returns the command that runs checks, apart from the project's own tests."""
-    paths = sorted(str(path) for path in CHECKS.glob(files))
+def _pytest(report: str) -> list[str]:
+    """Returns the command that runs the checks, apart from the project's own tests."""
+    paths = sorted(str(path) for path in CHECKS.glob("*check_*.py"))
     plain = ["--rootdir", str(CHECKS), "-c", os.devnull, "-p", "no:cacheprovider"]
     # line by line, so that what is stopped says where it stood
     form = ["--tb=short", "-v", f"--junitxml={report}", "-o", "junit_family=xunit1"]
-    return [sys.executable, "-m", "pytest", *plain, *form, "-k", only, *paths]
+    return [sys.executable, "-m", "pytest", *plain, *form, *paths]
 
 
 def claims_of(report: Path, otherwise: str) -> list[Claim]:
@@ -115,41 +94,16 @@ def claims_of(report: Path, otherwise: str) -> list[Claim]:
     return claims
 
 
-def _under_umockdev(folder: Path) -> list[Claim]:
-    bed, report = folder / "bed", folder / "report.xml"
-    make_test_bed(bed)
-    variables = {
-        "LD_PRELOAD": PRELOAD,
-        "UMOCKDEV_DIR": str(bed),
-        "HAPTICBRIDGE_TIER": "umock",
-        "PYTHONPATH": f"{CHECKOUT}:{CHECKOUT / 'tests'}",
-    }
-    try:
-        command = [*_pytest(str(report)), f"--basetemp={folder / 'files'}"]
-        how: Any = {"capture_output": True, "text": True, "timeout": LIMIT}
-        ended = subprocess.run(command, env=os.environ | variables, check=False, **how)
-    except subprocess.TimeoutExpired:
-        return [Claim("the job ran", is_true=False, note=f"stopped after {LIMIT:g} s")]
-    return claims_of(report, ended.stdout + ended.stderr)
-
-
 def _in_the_guest(
-    folder: Path,
-    command: Sequence[str],
-    *,
-    is_virtual: bool,
-    patience: float | None = None,
-    compiled: Path | None = None,
+    folder: Path, command: Sequence[str], *, patience: float | None = None
 ) -> GuestRun:
     _compile_ahead()
-    variables = guest.python_environment() | {"HAPTICBRIDGE_TIER": "uml"}
-    if is_virtual:
-        variables["HAPTICBRIDGE_TIME"] = "virtual"
+    variables = guest.python_environment()
     if not guest.has_pidff():
         variables["HAPTICBRIDGE_NO_PIDFF"] = "1"
-    limits = {"timeout": LIMIT, "patience": patience}
-    how = {"environment": variables, "is_virtual": is_virtual, "compiled": compiled}
-    return guest.run_in_guest(command, folder, **limits, **how)  # type: ignore[arg-type]
+    return guest.run_in_guest(
+        command, folder, environment=variables, timeout=LIMIT, patience=patience
+    )
 
 
 _compiling = threading.Lock()
@@ -161,31 +115,18 @@ def _compile_ahead() -> None:
         compile_ahead()
 
 
-def _checks(folder: Path, *which: str, is_virtual: bool) -> list[Claim]:
-    """Runs checks in a guest, and finds what they claim."""
-    command = _pytest("/run/job/report.xml", *which)
-    run = _in_the_guest(folder, command, is_virtual=is_virtual, patience=guest.PATIENCE)
+def _checks(folder: Path) -> list[Claim]:
+    """Runs the checks in a guest, and finds what they claim."""
+    run = _in_the_guest(folder, _pytest("/run/job/report.xml"), patience=guest.PATIENCE)
     return claims_of(folder / "report.xml", run.output)
 
 
-def _checks_in_virtual_time(folder: Path) -> list[Claim]:
-    return _checks(folder, "*check_*.py", is_virtual=True)
-
-
-def _recorded(
-    folder: Path, loops: Mapping[str, float], compiled: Path | None = None
-) -> tuple[GuestRun, list[Path]]:
-    """Runs ``hapticbridge run`` on emulated devices in virtual time, in one guest."""
-    folder.mkdir(exist_ok=True)
-    command = [sys.executable, "-m", "usb_tiers.closed_loop", "/run/job"]
-    command += [f"{device}:{seconds:g}" for device, seconds in loops.items()]
-    ended = _in_the_guest(folder, command, is_virtual=True, compiled=compiled)
-    return ended, [folder / f"{device}.mcap" for device in loops]
-
-
 def _closed_loops(folder: Path) -> list[Claim]:
-    ended, files = _recorded(folder, LOOPS)
-    return [_closed_loop(ended, device, file) for device, file in zip(LOOPS, files, strict=True)]
+    """Runs ``hapticbridge run`` on emulated devices, in one guest."""
+    command = [sys.executable, "-m", "usb_tiers.closed_loop", "/run/job"]
+    command += [f"{device}:{seconds:g}" for device, seconds in LOOPS.items()]
+    ended = _in_the_guest(folder, command)
+    return [_closed_loop(ended, device, folder / f"{device}.mcap") for device in LOOPS]
 
 
 def _closed_loop(ended: GuestRun, device: str, file: Path) -> Claim:
@@ -201,26 +142,9 @@ def _closed_loop(ended: GuestRun, device: str, file: Path) -> Claim:
     return Claim(name, is_good, f"{note} ({report.environment})")
 
 
-def _the_same_every_time(folder: Path) -> list[Claim]:
-    name = f"a 1 kHz loop in virtual time is the same in {REPEATS} runs: to the bit, times to 1 µs"
-    _compile_ahead()
-    snapshot = snapshot_of_compiled_code(folder / "compiled")
-
-    def run(number: int) -> tuple[GuestRun, Path]:
-        place = folder / str(number)
-        mine = shutil.copytree(snapshot, place / "compiled")
-        ended, (file,) = _recorded(place, {"rawhid": REPEATED_LOOP}, mine)
-        return ended, file
-
-    is_same, note = repeated(run, REPEATS)
-    return [Claim(name, is_same, note)]
-
-
 JOBS = (
-    Job("C: checks in User-Mode Linux, virtual time", _kernel_missing, _checks_in_virtual_time),
-    Job("C: closed loops", _kernel_missing, _closed_loops),
-    Job("C: 1 kHz loop, repeated", _kernel_missing, _the_same_every_time),
-    Job("B: checks under umockdev", _umockdev_missing, _under_umockdev),
+    Job("checks of the drivers", _kernel_missing, _checks),
+    Job("closed loops", _kernel_missing, _closed_loops),
 )
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-LOW_SPEED, FULL_SPEED, HIGH_SPEED = 1, 2, 3
+FULL_SPEED = 2
 BULK, INTERRUPT = 2, 3
 
 TO_HOST = 0x80

@@ -1,1 +1,1 @@
-"""Checks that run inside tiers B and C, started by ``emulated.tiers``."""
+"""Checks that run inside a User-Mode Linux, started by ``emulated.tiers``."""

@@ -103,7 +103,6 @@ def board(library: ctypes.CDLL) -> LoopBoard:
     mechanics = SimulatedDevice(
         mass=0.1, damping=2.0, friction=0.1, hand=FIRM, path=Motion(times, places)
     )
-    # slow enough for this process on a wall clock
     return LoopBoard(library, mechanics, BoardSheet(period=2.5e-4))
 
 

@@ -22,10 +22,9 @@ from hapticbridge.device.base import (
     USUAL_TORQUE_LIMIT,
     Device,
     DeviceInfo,
+    checked,
     checked_number,
     checked_period,
-    checked_read,
-    checked_write,
 )
 from hapticbridge.device.motion_file import read_motion
 from hapticbridge.device.simulated.dynamics import (
@@ -380,9 +379,7 @@ class GrippingDevice:
     """
 
     def __init__(self, device: Device, grip: Device, travel: float | None = None) -> None:
-        self._device, self._grip = device, grip
-        self._reads = checked_read(device), checked_read(grip)
-        self._writes = checked_write(device), checked_write(grip)
+        self._device, self._grip = checked(device), checked(grip)
         sheet = replace(grip.info, name=f"grip of {device.info.name}", axes=("x",), reach=travel)
         self.info = replace(device.info, grip_axis=sheet)
 
@@ -400,9 +397,9 @@ class GrippingDevice:
         Raises:
             DeviceLost: One of them is gone, or silent for too long.
         """
-        flags = self._reads[0](sample[:1])
+        flags = self._device.read(sample[:1])
         if sample.size > 1:
-            flags |= self._reads[1](sample[1:2])
+            flags |= self._grip.read(sample[1:2])
         return flags & int(TickFlag.STALE_SAMPLE)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
@@ -413,8 +410,8 @@ class GrippingDevice:
         """
         both = np.zeros((2, 6)) if wrench.ndim == 1 else wrench
         with ExitStack() as stack:  # if the first fails, the second still gets its own
-            stack.callback(self._writes[1], both[1])
-            self._writes[0](wrench if wrench.ndim == 1 else both[0])
+            stack.callback(self._grip.write, both[1])
+            self._device.write(wrench if wrench.ndim == 1 else both[0])
 
     def close(self) -> None:
         """Closes both."""

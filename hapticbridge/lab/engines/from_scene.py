@@ -7,7 +7,6 @@ from itertools import combinations
 import mujoco
 import numpy as np
 
-from hapticbridge.arguments import Array
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
@@ -22,6 +21,7 @@ from hapticbridge.kernel.pose import (
 )
 from hapticbridge.lab.engines import base
 from hapticbridge.scene import Scene
+from hapticbridge.scene.physics import quaternion_of
 
 _KINDS: dict[int, base.Kind] = {
     mujoco.mjtGeom.mjGEOM_BOX: "box",
@@ -77,7 +77,7 @@ def task_from_scene(
         name=scene.name,
         body=tool_free.body,
         fixed=tuple(
-            _shape(model, i, _pose(data.geom_xpos[i], _quaternion(data.geom_xmat[i])))
+            _shape(model, i, _pose(data.geom_xpos[i], quaternion_of(data.geom_xmat[i])))
             for i in touching
             if not _is_free(model, model.geom_bodyid[i])
         ),
@@ -230,9 +230,3 @@ def _vector(values: object) -> tuple[float, float, float]:
 def _four(values: object) -> tuple[float, float, float, float]:
     w, x, y, z = (float(value) for value in np.asarray(values))
     return w, x, y, z
-
-
-def _quaternion(matrix: Array) -> Array:
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, matrix)
-    return quaternion

@@ -288,9 +288,11 @@ def agreement(measured: ArrayLike, predicted: ArrayLike, width: float = WIDTH) -
     return max(float(known.max()), width / 2) if known.size else None
 
 
-def used_damping(
-    name: str, stiffness: ArrayLike, damping: ArrayLike, period: float
-) -> NDArray[np.float64]:
+PERIOD = 1e-3
+"""Period T in s of the runs of a map, unless it varies the period."""
+
+
+def used_damping(name: str, stiffness: ArrayLike, damping: ArrayLike) -> NDArray[np.float64]:
     """Returns B' in N s/m, the damping of a method's law: max(B − a K T, 0).
 
     It is ``Method.law_coupling`` over arrays; the method's integration adds a K T again.
@@ -299,9 +301,8 @@ def used_damping(
         name: The method; a is its ``compensated_share``.
         stiffness: K in N/m.
         damping: Requested B in N s/m; broadcasts with K.
-        period: T in s.
     """
-    taken = METHODS[name].compensated_share * period * np.asarray(stiffness, dtype=np.float64)
+    taken = METHODS[name].compensated_share * PERIOD * np.asarray(stiffness, dtype=np.float64)
     return np.asarray(np.maximum(np.asarray(damping, dtype=np.float64) - taken, 0.0))
 
 
@@ -317,24 +318,20 @@ def law_in_words(name: str, subscript: str = "") -> str:
     return f"B{subscript}′ = B{subscript}{taken}"
 
 
-def needed_by_6(
-    name: str, stiffness: ArrayLike, damping: ArrayLike, period: float
-) -> NDArray[np.float64]:
+def needed_by_6(name: str, stiffness: ArrayLike, damping: ArrayLike) -> NDArray[np.float64]:
     """Returns the device damping in N s/m that (6) requires, K T/2 + B'."""
-    spring = np.asarray(stiffness, dtype=np.float64) * period / 2
-    return np.asarray(spring + used_damping(name, stiffness, damping, period))
+    spring = np.asarray(stiffness, dtype=np.float64) * PERIOD / 2
+    return np.asarray(spring + used_damping(name, stiffness, damping))
 
 
-def limit_by_6(
-    name: str, device_damping: float, period: float, damping: ArrayLike
-) -> NDArray[np.float64]:
+def limit_by_6(name: str, device_damping: float, damping: ArrayLike) -> NDArray[np.float64]:
     """Returns the K in N/m at which K T/2 + B' = b, for B < b.
 
     That is 2 (b − B)/T for methods that use B as requested. For methods that subtract their own
     damping (compensated_share ½ or 1) the limit is 2b/T, because B' is 0 there.
     """
     spent = np.asarray(damping, dtype=np.float64) * (METHODS[name].compensated_share == 0.0)
-    return np.asarray(maximum_stiffness(device_damping, period, spent))
+    return np.asarray(maximum_stiffness(device_damping, PERIOD, spent))
 
 
 METHOD_COLOURS = {name: f"C{place}" for place, name in enumerate(METHODS)}

@@ -17,12 +17,11 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from hapticbridge.lab.maps import base, contact_rigs
-from hapticbridge.lab.maps.base import Point, Sentences
+from hapticbridge.lab.maps.base import PERIOD, Point, Sentences
 from hapticbridge.lab.maps.contact_rigs import (
     COMPARED_RIGS,
     FRICTIONS,
     MASSES,
-    PERIOD,
     RIGID,
     RIGS,
     SCENE,

@@ -23,9 +23,6 @@ from hapticbridge.lab.maps import base
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import Scene, load_scene, scene_path
 
-PERIOD = 1e-3
-"""Period T in s of a run, unless another is chosen."""
-
 SHIPPED_SOLIMP = (0.9, 0.95, 0.001)
 """Impedance d₀, d_w and width in m of the shipped scenes."""
 
@@ -269,7 +266,7 @@ class Treatment:
     method: str = "implicit"
     solref: tuple[float, float] = (0.002, 1.0)
     cone: str = "elliptic"
-    period: float = PERIOD
+    period: float = base.PERIOD
     substeps: int = 1
 
     def apply(self, scene: Scene, case: Case) -> None:

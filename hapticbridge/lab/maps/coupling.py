@@ -16,16 +16,13 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.lab.maps import base
-from hapticbridge.lab.maps.base import Point, Sentences
+from hapticbridge.lab.maps.base import PERIOD, Point, Sentences
 from hapticbridge.lab.maps.tool_mass import effective_response, worst_angle
 from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.lab.methods import METHODS, THEORIES
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep import Table
 from hapticbridge.theory.sampled_loop import WorstHand
-
-PERIOD = 1e-3
-"""Period T in s."""
 
 DEVICE_DAMPING = 2.0
 """Device damping b in N s/m, that of the default simulated device."""
@@ -236,7 +233,7 @@ def _draw_theory(axes: Axes, name: str, *, has_wall: bool) -> None:
     b = DEVICE_DAMPING
     if has_wall:
         fine = np.linspace(*DAMPING, FINE), np.geomspace(*STIFFNESS, FINE)
-        by_6 = base.needed_by_6(name, fine[1][:, None], fine[0], PERIOD)
+        by_6 = base.needed_by_6(name, fine[1][:, None], fine[0])
         axes.contour(*fine, by_6, levels=[b], colors="black", linewidths=1.8)
     if has_wall and METHODS[name].compensated_share == 0.0:
         # (7) as θ → 0: (K T)² = 2 b (K T + 2 B)
@@ -266,7 +263,7 @@ def _first_alike(name: str) -> str:
 def _needed(name: str) -> NDArray[np.float64]:
     """Returns the device damping in N s/m that a free tool needs, rows by K and columns by B."""
     stiffness, damping = np.geomspace(*STIFFNESS, CONTOUR), np.linspace(*DAMPING, CONTOUR)
-    used = base.used_damping(name, stiffness[:, None], damping, PERIOD)
+    used = base.used_damping(name, stiffness[:, None], damping)
     return np.array(
         [
             [worst_angle(THEORIES[name], k, float(b), TOOL_MASS, PERIOD)[1] for b in row]
@@ -287,7 +284,7 @@ def summarize(table: Table) -> dict[str, Any]:
 
 def _cells_below(name: str, cells: Table) -> dict[str, Any]:
     """Counts the outcomes at a method's points below (6), where a device bears the coupling."""
-    needed = base.needed_by_6(name, cells["stiffness"], cells["damping"], PERIOD)
+    needed = base.needed_by_6(name, cells["stiffness"], cells["damping"])
     below = needed < DEVICE_DAMPING
     selected = cells.select(below)
     is_passive = verdicts_of(selected) <= base.VERDICTS.index("within slack")
@@ -306,7 +303,7 @@ def _limits(name: str, limits: Table) -> dict[str, Any]:
     """Compares the limits that were found on a wall with (6); empty where none was searched."""
     if not len(limits):
         return {}
-    predicted = base.limit_by_6(name, DEVICE_DAMPING, PERIOD, limits["damping"])
+    predicted = base.limit_by_6(name, DEVICE_DAMPING, limits["damping"])
     measured = limits.numbers("limit")
     return {
         "damping": limits["damping"].tolist(),

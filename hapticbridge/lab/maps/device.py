@@ -24,7 +24,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
-from hapticbridge.lab.maps.base import Point, Sentences
+from hapticbridge.lab.maps.base import PERIOD, Point, Sentences
 from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
@@ -42,9 +42,6 @@ DAMPERS = (0.0, 3.0)
 below which ``lossless`` and ``compensated`` use none, are 1 and 2."""
 
 REGIONS = ("passive", "locally stable", "bounded limit cycle", "unstable")
-
-PERIOD = 1e-3
-"""Period T in s."""
 
 STIFFNESS = 2000.0
 """Stiffness K in N/m. Results depend on β = b/(K T) and σ = f_c/(K Δ), and slightly on the mass."""
@@ -188,7 +185,7 @@ def friction_needed(name: str, damping: NDArray[np.float64]) -> NDArray[np.float
     References:
         Abbott & Okamura 2005.
     """
-    return 0.5 + base.used_damping(name, STIFFNESS, damping, PERIOD) / (PERIOD * STIFFNESS)
+    return 0.5 + base.used_damping(name, STIFFNESS, damping) / (PERIOD * STIFFNESS)
 
 
 def friction_to_rest(name: str, damping: float) -> float:

@@ -22,16 +22,13 @@ from hapticbridge.demand.guard import UNLIMITED
 from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
-from hapticbridge.lab.maps.base import Point, Sentences
+from hapticbridge.lab.maps.base import PERIOD, Point, Sentences
 from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.scene import Scene
 from hapticbridge.sweep import Table
 from hapticbridge.theory.sampled_loop import WorstHand
-
-PERIOD = 1e-3
-"""Period T in s."""
 
 DEVICE_DAMPING = 2e-3
 """Rotational damping b_θ in N m s/rad, that of the default simulated device."""
@@ -187,10 +184,7 @@ BEHIND = ("implicit", "compensated", "lossless")
 
 METHODS_SHOWN = ("direct", *BEHIND)
 
-BOUNDS = {
-    name: float(base.limit_by_6(name, DEVICE_DAMPING, PERIOD, ROTATIONAL_DAMPING))
-    for name in BEHIND
-}
+BOUNDS = {name: float(base.limit_by_6(name, DEVICE_DAMPING, ROTATIONAL_DAMPING)) for name in BEHIND}
 """Largest K_r in N m/rad by (6): 2 (b_θ − B_r)/T for ``implicit``; 2 b_θ/T for the others, whose B'
 is 0 there."""
 

@@ -22,7 +22,7 @@ from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
 from hapticbridge.lab.maps import base
-from hapticbridge.lab.maps.base import Point, Sentences
+from hapticbridge.lab.maps.base import PERIOD, Point, Sentences
 from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
@@ -34,9 +34,6 @@ from hapticbridge.sweep import Table
 INERTIA = np.array([1.5e-3, 3.63e-3, 4.53e-3])
 """Principal moments of inertia of the tool about x, y, z in kg m². They all differ, so that it
 tumbles, and are near those of a hand tool with a long handle."""
-
-PERIOD = 1e-3
-"""Period T in s."""
 
 TICKS = 1000
 

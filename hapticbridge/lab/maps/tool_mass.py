@@ -18,7 +18,7 @@ from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
-from hapticbridge.lab.maps.base import Point, Sentences
+from hapticbridge.lab.maps.base import PERIOD, Point, Sentences
 from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.lab.methods import METHODS, THEORIES
 from hapticbridge.plotting import new_figure
@@ -140,9 +140,6 @@ def _check(method: str) -> None:
         raise StudyError(f"no theory for method '{method}' here; choose {choices(NAMES)}")
 
 
-PERIOD = 1e-3
-"""Period T in s."""
-
 DEVICE_DAMPING = 20.0
 """Device damping b in N s/m: a well damped device, so that stiff couplings are possible. The loop
 is linear. With a tenth of b, B and K everything here happens at a tenth of the tool's mass."""
@@ -248,7 +245,7 @@ def hand_worst_for(name: str, stiffness: float, mass: float) -> WorstHand:
 
 def law_damping(name: str, stiffness: float) -> float:
     """Returns B' in N s/m of a method's law where ``DAMPING`` is requested."""
-    return float(base.used_damping(name, stiffness, DAMPING, PERIOD))
+    return float(base.used_damping(name, stiffness, DAMPING))
 
 
 def coupling_of(stiffness: float) -> Coupling:
@@ -400,9 +397,7 @@ def _draw_theory(axes: Axes, name: str) -> None:
     if name == "implicitfast":
         # its spring lags by a step, so E_k = K δx² − ½ m (Δv)², against a slack of ½ (K + B/T) δx²
         axes.axhline(DAMPING / PERIOD, color="black", ls="-.", lw=1.4)
-    axes.axhline(
-        float(base.limit_by_6(name, DEVICE_DAMPING, PERIOD, DAMPING)), color="black", lw=1.8
-    )
+    axes.axhline(float(base.limit_by_6(name, DEVICE_DAMPING, DAMPING)), color="black", lw=1.8)
 
 
 def summarize(table: Table) -> dict[str, Any]:
@@ -426,7 +421,7 @@ def summarize(table: Table) -> dict[str, Any]:
 def _counts(name: str, cells: Table) -> dict[str, Any]:
     """Returns the number of unstable tools, and the energy that the stable ones created."""
     stable = is_stable(cells)
-    is_below = base.needed_by_6(name, cells["stiffness"], DAMPING, PERIOD) < DEVICE_DAMPING
+    is_below = base.needed_by_6(name, cells["stiffness"], DAMPING) < DEVICE_DAMPING
     return {
         "points": len(cells),
         "unstable_held_still": int((cells.numbers("stable_held_still") != 1).sum()),
