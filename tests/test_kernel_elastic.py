@@ -48,7 +48,7 @@ def test_a_start_stores_what_the_continuum_stores() -> None:
     for seed in range(5):
         moved = np.random.default_rng(seed).normal(0, 0.02, (4, 3))
         binding, _ = bind(load(stretched(moved)))
-        found = float(binding.state["elastic"]["energy"][0])
+        found = float(binding.state["elastic"]["stored"][0])
         assert found == pytest.approx(energy_of(CORNERS + moved), rel=1e-9)
 
 

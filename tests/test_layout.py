@@ -211,6 +211,7 @@ WRITERS = {
     "pose": "handle",
     "loop": "tick",
     "energy": "ledger",
+    "elastic": "elastic",
     "guard": "tick_guard",
     "watch": "swing_watch",
     "observer": "passivity_controller",

@@ -41,7 +41,7 @@ ELASTIC_DTYPE = np.dtype(
         ("plastic", "<i8"),
         ("own_plastic", "<i8"),
         ("nplastic", "<i8"),
-        ("energy", "<f8"),
+        ("stored", "<f8"),
     ]
 )
 """Sub-record ``elastic``: U in J, and addresses: the second model and its data, its positions, its
@@ -91,7 +91,7 @@ def start_elastic(s: State) -> None:
     """Computes U at the present positions, without a way from others."""
     if s.elastic.model:
         _copy(s.elastic.rest, s.elastic.last, s.mj.nq)
-        s.elastic.energy = 0.0
+        s.elastic.stored = 0.0
         _add_way(s, PARTS)
 
 
@@ -105,12 +105,12 @@ def follow_elastic(s: State) -> None:
 @compiled
 def elastic_energy(s: State) -> float:
     """Returns V_U in J, the part of U that was stored."""
-    return float(max(s.elastic.energy, 0.0))
+    return float(max(s.elastic.stored, 0.0))
 
 
 def unstored_energy(s: State) -> float:
     """Returns the energy in J that the flexes gave without having stored it, max(−U, 0)."""
-    return max(-float(s["elastic"]["energy"]), 0.0)
+    return max(-float(s["elastic"]["stored"]), 0.0)
 
 
 @compiled
@@ -129,7 +129,7 @@ def _add_way(s: State, parts: int) -> None:
             mj_passive(elastic.model, elastic.data)
             for i in range(mj.nv):
                 work += force[i] * way[i]
-    elastic.energy -= 0.5 * work / parts
+    elastic.stored -= 0.5 * work / parts
     _copy(mj.qpos, elastic.last, mj.nq)
 
 
