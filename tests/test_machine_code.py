@@ -460,12 +460,17 @@ print("numba" in sys.modules)
 """
 
 
-def test_a_run_with_commands_needs_no_numba_once_its_code_is_on_disk() -> None:
+def on_second_run(program: str) -> str:
+    """Returns what a program prints once its machine code is on disk."""
     for _ in range(2):
         process = subprocess.run(
-            [sys.executable, "-c", RUN], capture_output=True, text=True, check=True
+            [sys.executable, "-c", program], capture_output=True, text=True, check=True
         )
-    assert process.stdout == "False\n"
+    return process.stdout
+
+
+def test_a_run_with_commands_needs_no_numba_once_its_code_is_on_disk() -> None:
+    assert on_second_run(RUN) == "False\n"
 
 
 PUSHED = """
@@ -515,11 +520,7 @@ print(arm.is_pushed, late, "numba" in sys.modules)
 
 def test_nothing_is_compiled_or_loaded_once_a_motor_is_on() -> None:
     """The probe's first pushes would last as long as that, in which the motor holds its force."""
-    for _ in range(2):
-        process = subprocess.run(
-            [sys.executable, "-c", PUSHED], capture_output=True, text=True, check=True
-        )
-    assert process.stdout == "x, y, z, rx, ry, rz answered the right way\nTrue [] False\n"
+    assert on_second_run(PUSHED) == "x, y, z, rx, ry, rz answered the right way\nTrue [] False\n"
 
 
 DRAGGED = """
