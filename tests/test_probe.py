@@ -175,7 +175,7 @@ def test_a_hand_that_holds_too_firmly_is_not_judged_and_the_certificate_says_so(
     still = "the positions of x, y, z never changed (sensor, cable, axis or a firm hand)"
     assert summary.probe == still
     assert device.gained <= 1e-3
-    said = "; the probe could not tell if x, y, z push the right way"
+    said = "; the probe could not tell if the motors of x, y, z push the right way"
     assert said in summary.certification.words
     judged = audit(path).certification
     assert judged is not None
@@ -195,7 +195,10 @@ def test_an_axis_whose_position_never_changes_is_told_from_one_that_answers_uncl
         summary = bridge.run(0.1)
     still = "the position of y never changed (sensor, cable, axis or a firm hand)"
     assert summary.probe == f"x, z answered the right way, {still}"
-    assert "the probe could not tell if y push the right way" in summary.certification.words
+    assert (
+        "the probe could not tell if the motors of y push the right way"
+        in summary.certification.words
+    )
 
 
 @pytest.mark.parametrize(

@@ -84,8 +84,9 @@ def _falling_bodies(case: SceneUnderCheck, seen: Observation) -> Iterator[Fault]
             yield Fault(
                 "falling body",
                 place,
-                f"nothing holds {place.element}: it fell by {number(fallen)} m in the motion",
-                'a floor below it, no joint, or gravcomp="1"',
+                f"nothing holds {place.element}: it fell by {number(fallen)} m along gravity "
+                "in the motion",
+                'a floor in its way, no joint, or gravcomp="1"',
             )
 
 

@@ -203,7 +203,7 @@ class Certification:
         """Clause on axes of which the probe could not tell the direction."""
         if not self.unanswered:
             return ""
-        return f"; the probe could not tell if {self.unanswered} push the right way"
+        return f"; the probe could not tell if the motors of {self.unanswered} push the right way"
 
     @property
     def fact(self) -> str:
