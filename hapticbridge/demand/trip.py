@@ -54,10 +54,7 @@ _WORDS = {
     ),
     TripCode.CONTACTS_FULL: codes.WARNINGS[codes.CONTACTS_FULL],
     TripCode.CONSTRAINTS_FULL: codes.WARNINGS[codes.CONSTRAINTS_FULL],
-    TripCode.DIVERGED: (
-        "the simulation is no longer finite (force, pose or energy); the scene diverged, so lower "
-        "the stiffness or the period, or see with 'hapticbridge check SCENE' what pumps"
-    ),
+    TripCode.DIVERGED: "the simulation is no longer finite (force, pose or energy)",
     TripCode.SIMULATION: "MuJoCo stopped: {}",
     TripCode.DEVICE: "{}",
     TripCode.ZERO_FORCE: "zero force could not be sent: {}",
@@ -81,6 +78,10 @@ _REMEDIES = {
         "slip on instead: --angle-limit inf"
     ),
     TripCode.GAVE_ENERGY: "lower --stiffness",
+    TripCode.DIVERGED: (
+        "'hapticbridge check SCENE' looks for what makes it diverge; if it finds nothing, lower the "
+        "stiffness or the period"
+    ),
     TripCode.CONTACTS_FULL: codes.WARNING_REMEDIES[codes.CONTACTS_FULL],
     TripCode.CONSTRAINTS_FULL: codes.WARNING_REMEDIES[codes.CONSTRAINTS_FULL],
 }
