@@ -79,8 +79,8 @@ _REMEDIES = {
     ),
     TripCode.GAVE_ENERGY: "lower --stiffness",
     TripCode.DIVERGED: (
-        "'hapticbridge check SCENE' looks for what makes it diverge; if it finds nothing, lower the "
-        "stiffness or the period"
+        "'hapticbridge check SCENE' looks for what makes it diverge; if it finds nothing, lower "
+        "the stiffness or the period"
     ),
     TripCode.CONTACTS_FULL: codes.WARNING_REMEDIES[codes.CONTACTS_FULL],
     TripCode.CONSTRAINTS_FULL: codes.WARNING_REMEDIES[codes.CONSTRAINTS_FULL],
