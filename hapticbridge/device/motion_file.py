@@ -292,8 +292,8 @@ MAX_STEP = 0.5
 times this is taken for µs, and more for ns."""
 
 MIN_STEP = 4e-5
-"""Median time in s between rows below which times are taken for µs or ms that stand where ns belong:
-a thousandth of the 1/25 s of slow trackers. No loop here is as fast."""
+"""Median time in s between rows below which times are taken for µs or ms where ns belong: a
+thousandth of the 1/25 s of slow trackers. No loop here is as fast."""
 
 _SMALLER = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
 """Number of these units of time in 1 s."""
