@@ -511,6 +511,19 @@ def test_a_damaged_recording_is_no_motion_and_a_cut_one_says_so(tmp_path: Path) 
             read()
 
 
+@pytest.mark.parametrize("ending", [".db3", ".bag", ".zstd", ".gz"])
+@pytest.mark.parametrize("begin", [b"", bytes(4096)])
+def test_a_file_that_is_not_what_its_ending_says_is_called_so(
+    ending: str, begin: bytes, tmp_path: Path
+) -> None:
+    path = tmp_path / f"hand{ending}"
+    with pytest.raises(DeviceError, match="no such file"):
+        open_device(f"trajectory:{path}")
+    path.write_bytes(begin)
+    with pytest.raises(DeviceError, match=f"damaged, empty or misnamed.* the ending {ending}"):
+        open_device(f"trajectory:{path}")
+
+
 def test_a_bag_in_sqlite_and_a_folder_of_several_are_told(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     bag.mkdir()
