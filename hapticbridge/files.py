@@ -249,15 +249,18 @@ _FOREIGN = {
 def foreign_kind(path: Path) -> str:
     """Returns the kind of a bag or packed file that is not read, and what makes it readable.
 
-    The kind follows from the file's first bytes or its ending. It is empty for any other file.
+    The kind follows from the file's first bytes; one whose ending promises others is damaged. It is
+    empty for any other file, and for one that cannot be read.
     """
-    start = b""
-    with suppress(OSError, ValueError):
-        if path.is_file():
-            with path.open("rb") as file:
-                start = file.read(16)
+    try:
+        with path.open("rb") as file:
+            start = file.read(16)
+    except (OSError, ValueError):
+        return ""
     kinds = (kind for begin, kind in _FOREIGN.values() if start.startswith(begin))
-    return next(kinds, _FOREIGN.get(path.suffix, (b"", ""))[1])
+    is_wrong = path.suffix in _FOREIGN
+    wrong = f"damaged, empty or misnamed: it does not begin as a file with the ending {path.suffix}"
+    return next(kinds, wrong if is_wrong else "")
 
 
 def draft_of(target: Path) -> Path:

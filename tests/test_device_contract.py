@@ -530,6 +530,7 @@ def test_options_reach_the_device_and_the_specification_goes_first(tmp_path: Pat
         ("Omega.7", {}, "did you mean 'forcedimension' (Force Dimension omega, "),
         ("geomagic", {}, "did you mean 'touch' ("),
         ("phantom", {}, "did you mean 'touch' ("),
+        ("omni", {}, "did you mean 'touch' ("),
         ("novint", {}, "did you mean 'falcon' ("),
         ("SpaceNavigator", {}, "did you mean 'spacemouse' ("),
         ("xbox", {}, "unknown device 'xbox'; choose one of "),

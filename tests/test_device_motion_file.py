@@ -425,6 +425,21 @@ def test_times_in_smaller_units_are_said_and_run(tmp_path: Path, unit: str, coun
         assert read_motion(tmp_path / "hand.csv").duration == pytest.approx(0.29 * count)
 
 
+@pytest.mark.parametrize("factor", [1000, 1_000_000])
+@pytest.mark.parametrize("is_stamped", [False, True])
+def test_times_of_a_bag_in_larger_units_are_said(
+    tmp_path: Path, factor: int, *, is_stamped: bool
+) -> None:
+    true = [10**18 + 40_000_000 * i // 2 for i in range(30)]  # 50 Hz, over 0.58 s
+    poses = [
+        (at // factor, pose_message(at // factor if is_stamped else 0, 1e-3 * i))
+        for i, at in enumerate(true)
+    ]
+    (file,) = bag(tmp_path / "walk", {"/hand": poses}).glob("*.mcap")
+    with pytest.warns(UserWarning, match=r"rows are .* apart, .* wrote µs or ms there, multiply"):
+        assert read_bag(file).duration == pytest.approx(0.58 / factor)
+
+
 def test_a_slow_walk_and_a_few_rows_are_no_mistake(tmp_path: Path) -> None:
     walk = "".join(f"{i},{0.5 * i},0,0\n" for i in range(19))
     (tmp_path / "hand.csv").write_text("t,x,y,z\n" + walk)
@@ -494,6 +509,19 @@ def test_a_damaged_recording_is_no_motion_and_a_cut_one_says_so(tmp_path: Path) 
     for read in (lambda: open_device(f"trajectory:{run}"), lambda: motion_for(scene, run)):
         with pytest.warns(UserWarning, match="its end is missing.*; the motion ends there"):
             read()
+
+
+@pytest.mark.parametrize("ending", [".db3", ".bag", ".zstd", ".gz"])
+@pytest.mark.parametrize("begin", [b"", bytes(4096)])
+def test_a_file_that_is_not_what_its_ending_says_is_called_so(
+    ending: str, begin: bytes, tmp_path: Path
+) -> None:
+    path = tmp_path / f"hand{ending}"
+    with pytest.raises(DeviceError, match="no such file"):
+        open_device(f"trajectory:{path}")
+    path.write_bytes(begin)
+    with pytest.raises(DeviceError, match=f"damaged, empty or misnamed.* the ending {ending}"):
+        open_device(f"trajectory:{path}")
 
 
 def test_a_bag_in_sqlite_and_a_folder_of_several_are_told(tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def test_a_table_has_the_hand_that_is_named(
     assert main([*run, "--hand", "middle", "--overwrite"]) == 2
     assert "has no hand at 'middle'; its hands hold 'left', 'right'" in capsys.readouterr().err
     assert main([*run, "--overwrite"]) == 2
-    assert "takes one with --hand" in " ".join(capsys.readouterr().err.split())
+    assert "takes one with --hand for a table" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_cut_recording_of_two_hands_is_repaired(long_bar: Path, tmp_path: Path) -> None:

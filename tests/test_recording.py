@@ -154,6 +154,11 @@ def test_repair_refuses_what_is_whole_and_what_exists(whole: Path, tmp_path: Pat
     with pytest.raises(RecordingError, match="is not cut"):
         repair(whole, tmp_path / "new.mcap")
     assert not (tmp_path / "new.mcap").exists()
+    damaged, content = tmp_path / "damaged.mcap", bytearray(whole.read_bytes())
+    content[content.index(b"application/") + 20] ^= 1
+    damaged.write_bytes(content)
+    with pytest.raises(RecordingError, match=r"is not cut, only damaged: the .* is damaged"):
+        repair(damaged, tmp_path / "new.mcap")
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole.read_bytes()[:-20])
     before = cut.read_bytes()

@@ -418,6 +418,30 @@ def test_a_fast_turn_without_contact_is_suspected_and_a_slow_one_is_not(made: Ma
     assert (cause.kind, "0.03 rad a tick (30 rad/s)" in cause.evidence) == ("rate", True)
 
 
+def test_a_link_that_turns_faster_than_the_tool_is_named(tmp_path: Path) -> None:
+    path, scene = tmp_path / "run.mcap", tmp_path / "leg.xml"
+    scene.write_text(
+        """<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .35"><freejoint/>
+        <geom type="capsule" fromto="-.2 0 0 .2 0 0" size=".05" mass="5"/><site name="grip"/>
+        <body pos=".2 0 0"><joint name="hip" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -.15" size=".02" mass=".2"/>
+        <body name="foot" pos="0 0 -.15"><joint name="ankle" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -.1" size=".01" mass=".01"/></body></body></body>
+        </worldbody><actuator><motor name="hip" joint="hip" gear="500"/>
+        <motor name="ankle" joint="ankle" gear="200"/></actuator></mujoco>"""
+    )
+    with (
+        Bridge(str(scene), clock=SimulatedClock(), recording=path) as bridge,
+        pytest.raises(hb.SafetyTrip),
+    ):
+        bridge.set_input(ctrl={"hip": 0.274, "ankle": -0.460})
+        bridge.run(duration=0.1)
+    cause = cause_of(read_recording(path), audit(path))
+    assert cause.kind == "rate"
+    assert "body 'foot' turned by up to" in cause.evidence
+    assert cause.remedy == "raise the rate, or turn body 'foot' slower"
+
+
 @pytest.mark.parametrize(
     ("run", "told"),
     [

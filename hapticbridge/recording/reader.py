@@ -584,8 +584,8 @@ def _hands_in(path: Path, meta: Mapping[str, str], hand: int | None, problems: l
         grips = choices([str(each.get("grip")) for each in (meta, *others)])
         raise RecordingError(
             f"{path} is a run of {count} hands ({grips}), and one is needed here: 'hapticbridge "
-            "export' takes one with --hand, read_recording(path, hand=0) in Python; 'audit', "
-            "'compare', 'view' and 'render' take them together"
+            "export' takes one with --hand for a table, read_recording(path, hand=0) in Python; "
+            "'audit', 'compare', 'view' and 'render' take them together"
         )
     if hand is not None and not 0 <= hand < count:
         raise RecordingError(f"{path} has no hand {hand}; its hands are 0 to {count - 1}")

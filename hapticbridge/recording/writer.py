@@ -478,7 +478,8 @@ def repair(path: str | Path, output: str | Path) -> Recording:
     path, output = Path(path), Path(output)
     recording, attachments = read_with_attachments(path, 0)
     if not recording.is_cut:
-        raise RecordingError(f"{path} is not cut, so there is nothing to repair")
+        damage = f", only damaged: {recording.problems[0]}" if recording.problems else ""
+        raise RecordingError(f"{path} is not cut{damage}, so there is nothing to repair")
     deadlines = recording.ticks["deadline_ns"][-1:].tolist()
     made = {
         "event": "repaired",

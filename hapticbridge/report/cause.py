@@ -325,7 +325,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
     if cause := own or _jump_cause(evidence, report, window, gained):
         return cause
     if share < MOST:
-        return _cause_without_contact(evidence, window, where)
+        return _cause_without_contact(evidence, report, window, where)
     if concerns := _concerns(evidence, pairs):
         first = concerns[0]
         return Cause("contact setting", f"{where}; {first.words}", f"write {first.change}")
@@ -424,17 +424,22 @@ def _flex_cause(
     return Cause("bottomless flex", unstored_words(model, given[-1]), firm_edges(step))
 
 
-def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
+def _cause_without_contact(
+    evidence: Evidence, report: AuditReport, window: slice, where: str
+) -> Cause:
     method, turned = evidence.method, _largest_turn(evidence, window)
     if method.hazard:
         return _method_cause(method, f"{where}; ")
     if turned > FAST_TURN:
+        what = "the tool"
+        if body := _faster_body(evidence, report, window, 2.0 * turned):
+            what, turned = body
         return Cause(
             "rate",
-            f"{where}; the tool turned by up to {format_number(turned, 2)} rad a tick "
+            f"{where}; {what} turned by up to {format_number(turned, 2)} rad a tick "
             f"({format_number(turned / evidence.parameters.period, 3)} rad/s), and MuJoCo takes "
             "the gyroscopic torque from the start of a step",
-            "raise the rate, or turn the tool slower",
+            f"raise the rate, or turn {what} slower",
         )
     return Cause(
         "unknown",
@@ -450,6 +455,24 @@ def _largest_turn(evidence: Evidence, window: slice) -> float:
     return float(
         np.linalg.norm(turn_between(quaternion[:-1], quaternion[1:]), axis=1).max(initial=0.0)
     )
+
+
+def _faster_body(
+    evidence: Evidence, report: AuditReport, window: slice, turned: float
+) -> tuple[str, float] | None:
+    """Returns the body that turned most in a tick, and by how many rad, if more than ``turned``."""
+    model = evidence.model
+    if model is None or report.agreement not in (Agreement.EXACT, Agreement.NEAR):
+        return None
+    try:
+        speeds = [np.linalg.norm(r.data.cvel[:, :3], axis=1) for r in _runs_in(evidence, window)]
+    except RecordingError:
+        return None
+    largest = np.nan_to_num(np.max(speeds, axis=0)) * evidence.parameters.period
+    body = int(np.argmax(largest))
+    if largest[body] <= turned:
+        return None
+    return f"body '{model.body(body).name or body}'", float(largest[body])
 
 
 def _pair_words(evidence: Evidence, pairs: Pairs) -> str:

@@ -404,7 +404,7 @@ def medium() -> str:
 
 DRIVER = Driver(
     name="touch",
-    about="3D Systems Touch, Geomagic and Phantom through the maker's library (OpenHaptics)",
+    about="3D Systems Touch, Geomagic and Phantom (Omni) through the maker's library (OpenHaptics)",
     ids=(UsbId(0x2988, 0x0302, "3D Systems Touch"), UsbId(0x2988, 0x0304, "3D Systems Touch")),
     vendor=0x2988,
     subsystem="tty",
