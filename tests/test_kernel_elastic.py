@@ -89,6 +89,41 @@ def test_a_flex_that_springs_back_is_no_energy_from_nowhere(tmp_path: Path) -> N
     assert potential[again - 1] < 0.9 * potential[0]
 
 
+ROD = """<flexcomp name="f" type="direct" dim="1" mass=".1" radius=".005"
+  point="0 0 0 .1 0 0 .2 0 0" element="0 1 1 2">
+  <contact selfcollide="none" contype="0" conaffinity="0"/>
+  <elasticity young="1e5" poisson=".3" damping="1e-6"/></flexcomp>"""
+
+
+@pytest.mark.parametrize("angle", [0.5, 2.0, 3.08])
+def test_a_rod_that_starts_folded_stores_the_energy_of_its_curvature(angle: float) -> None:
+    """½ E I κ²/l with κ = 2 tan(angle/2), of two edges of length l = 0.1 m."""
+    end = 0.1 * np.array([np.cos(angle) - 1.0, np.sin(angle), 0.0])
+    moved = " ".join(map(str, [0, 0, -1, 1, 0, 0, 0, *np.zeros(6), *end]))
+    scene = mjcf(TOOL + ROD, f'<keyframe><key name="home" qpos="{moved}"/></keyframe>')
+    binding, _ = bind(load(scene))
+    stiffness = 1e5 * np.pi * 0.005**4 / 4
+    energy = 0.5 * stiffness * (2 * np.tan(angle / 2)) ** 2 / 0.1
+    assert float(binding.state["elastic"]["stored"][0]) == pytest.approx(energy, rel=1e-7)
+
+
+PLATE = """<flexcomp name="f" type="grid" dim="2" count="4 4 1" spacing=".05 .05 .05" mass=".1"
+  radius=".005"><contact selfcollide="none" contype="0" conaffinity="0"/>
+  <elasticity young="1e5" poisson=".3" thickness="5e-3" elastic2d="both" yield="0.005"
+  damping="1e-6"/></flexcomp>"""
+
+
+@pytest.mark.parametrize(("substeps", "spread"), [(1, 0.004), (4, 0.004), (4, 0.03)])
+def test_a_flex_that_yields_creates_no_energy(substeps: int, spread: float) -> None:
+    """The force of a step has the strains from before it, and so has its work."""
+    moved = np.random.default_rng(3).normal(0, spread, 48)
+    qpos = "0 0 -1 1 0 0 0 " + " ".join(map(str, moved))
+    scene = mjcf(TOOL + PLATE, f'<keyframe><key name="home" qpos="{qpos}"/></keyframe>')
+    run = live(scene, at_rest(20), substeps=substeps)
+    assert np.abs(run.scene.data.plastic).max() > 1e-3
+    assert run.ticks["environment_energy"].max() < 1e-12
+
+
 BASKET = """<flexcomp name="basket" type="box" dim="2" count="3 3 3" spacing=".1 .1 .1" mass=".02"
   radius=".01"><contact selfcollide="none" contype="0" conaffinity="0"/>
   <edge equality="true" solref="{}"/>

@@ -385,7 +385,7 @@ class BoundKernel:
         self._own({"grip_dofs": dofs})
         mj["has_actuators"] = model.nactuator > own or bool(np.any(model.jnt_actgravcomp))
         mj["has_belts"] = np.any(model.geom_surfacevel)
-        self._elastic = bind_elastic(self._record["elastic"], model, data)
+        self._elastic = bind_elastic(self._record["elastic"], model)
         if parameters.scheme == Scheme.MASSLESS:
             self._own(massless_tool(model, grip))
             mj["tool_map_size"] = self._owned["tool_map"].size

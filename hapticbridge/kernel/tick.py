@@ -54,6 +54,7 @@ from hapticbridge.kernel.codes import (
 )
 from hapticbridge.kernel.compared_methods import compared_wrench, drive_compared
 from hapticbridge.kernel.contact_margins import follow_speed
+from hapticbridge.kernel.elastic import follow_elastic
 from hapticbridge.kernel.explicit_bias import take_back, take_mean_bias_in_substep
 from hapticbridge.kernel.force_level import (
     keep_state,
@@ -518,6 +519,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     if s.impact.share > 0.0 or (s.contact.bounces and s.contact.rebound_ratio > 0.0):
         note_blows(s)
     if count == 1 and not is_last:
+        follow_elastic(s)
         end_mocap_moves(s)
         return OK
     if s.shown.is_beside:
@@ -541,6 +543,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
         keep_wrench(state[i], work, force, torque, moved, turned)
     if not is_last:
         add_coupling_work(s.energy, loop.law_work)
+        follow_elastic(s)
         take_mean_bias_in_substep(s)
         return OK
     contacts, code = active_contacts(s), OK
