@@ -54,7 +54,9 @@ _WORDS = {
     ),
     TripCode.CONTACTS_FULL: codes.WARNINGS[codes.CONTACTS_FULL],
     TripCode.CONSTRAINTS_FULL: codes.WARNINGS[codes.CONSTRAINTS_FULL],
-    TripCode.DIVERGED: "the simulation is no longer finite (force, pose or energy)",
+    TripCode.DIVERGED: (
+        "the scene diverged: the simulation is no longer finite (force, pose or energy)"
+    ),
     TripCode.SIMULATION: "MuJoCo stopped: {}",
     TripCode.DEVICE: "{}",
     TripCode.ZERO_FORCE: "zero force could not be sent: {}",
