@@ -253,6 +253,8 @@ def foreign_kind(path: Path) -> str:
     empty for any other file, and for one that cannot be read.
     """
     try:
+        if not path.is_file():  # a pipe would wait for its writer
+            return ""
         with path.open("rb") as file:
             start = file.read(16)
     except (OSError, ValueError):
