@@ -415,13 +415,15 @@ def _flex_cause(
     if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
         return None
     try:
-        given = [unstored_energy(run.binding.state[0]) for run in _runs_in(evidence, window)]
+        whole = slice(max(window.start - 1, 0), window.stop)
+        sums = [unstored_energy(run.binding.state[0]) for run in _runs_in(evidence, whole)]
     except RecordingError:
         return None
-    if given[-1] <= MOST * float(gained.sum()):
+    given = sums[-1] - (sums[0] if window.start else 0.0)
+    if given <= MOST * float(gained.sum()):
         return None
     step = evidence.parameters.period / evidence.parameters.substeps
-    return Cause("bottomless flex", unstored_words(model, given[-1]), firm_edges(step))
+    return Cause("bottomless flex", unstored_words(model, given), firm_edges(step))
 
 
 def _cause_without_contact(

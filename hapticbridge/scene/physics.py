@@ -251,7 +251,10 @@ def unstored_words(model: mujoco.MjModel, energy: float) -> str:
 
 
 def firm_edges(step: float) -> str:
-    """Returns the change that keeps a flex from that; ``step`` is the scene's time step in s."""
+    """Returns the change of a flex with which it gives no energy that it never stored.
+
+    ``step`` is the scene's time step in s.
+    """
     return (
         f'write <edge equality="true" solref="{REFERENCE_STEPS * step:g} 1"> for it, which holds '
         'its edges more firmly, or elastic2d="both" without an equality of its edges'

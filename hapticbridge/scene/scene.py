@@ -218,7 +218,7 @@ class Scene:
     def tell_written_state(self) -> None:
         """Warns that a run begins at the start, if another state was written into the data.
 
-        A scene that was stepped, as by an earlier run, is none of these.
+        Of a scene that was stepped, as by an earlier run, nothing is said.
         """
         start = mujoco.MjData(self.model)
         go_to_start(self.model, start, self.grip)
