@@ -163,9 +163,9 @@ def test_warnings_are_a_repeated_sample_and_a_counted_saturation() -> None:
     assert device.read(again) == stale
     assert again.tobytes() == before.tobytes()
     assert ticks(device, stub, 3, WRENCH) == [0] * 3
-    assert device.saturated == 0
+    assert device.remark == ""
     ticks(device, stub, 4, np.array([30.0, 0, 0, 0, 0, 0]))
-    assert device.saturated == 4
+    assert device.remark == "the SDK has limited 4 forces"
     assert np.linalg.norm(stub.force()) == pytest.approx(12.0)
 
 

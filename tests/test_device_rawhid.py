@@ -129,7 +129,7 @@ def test_lost_frames_are_counted_and_the_newest_pose_is_used() -> None:
     model.lose = set(range(model.frames + 3, model.frames + 6))
     flags = [read(device, seam)[0] for _ in range(10)]
     assert flags.count(STALE) == 3
-    assert (device.states.lost, device.states.damaged) == (3, 0)
+    assert device.remark == "3 state frames lost, 0 damaged"
 
 
 @pytest.mark.parametrize("lost", [0, 1, 2])
@@ -166,7 +166,7 @@ def test_a_repeated_frame_is_nothing_new() -> None:
     assert device.read(np.zeros(1, SAMPLE_DTYPE)) == 0
     model.push(report)
     assert device.read(np.zeros(1, SAMPLE_DTYPE)) == STALE
-    assert (device.states.repeated, device.states.lost) == (2, 0)
+    assert device.states.lost == 0
 
 
 def test_after_a_pause_the_pose_is_a_fresh_one_though_the_queue_is_full_of_old_ones() -> None:

@@ -53,7 +53,7 @@ class Scripted(ScriptedDevice):
     """Device that moves as told and keeps what it was sent."""
 
     def __init__(self, name: str, speed: float, **sheet: Any) -> None:
-        self.speed, self.every, self.last_tick = speed, 1, 1 << 30
+        self.speed, self.every, self.last_tick, self.remark = speed, 1, 1 << 30, ""
         super().__init__(
             lambda tick: (1e-3 * self.speed * tick, 0, 0, 1, 0, 0, 0),
             is_stale=lambda tick: tick % self.every != 0,
@@ -118,6 +118,18 @@ def test_a_device_with_a_grip_axis_gets_a_row_for_each_of_its_hands_at_zero_forc
     zero_sent, sent = zip(one.writes, gripper.writes, strict=True)
     assert [each.shape for each in (*zero_sent, *sent)] == [(6,), (2, 6)] * 2
     assert np.array_equal(sent[1], wrenches[1:])
+
+
+def test_the_summary_says_what_a_driver_lost_with_the_hand_that_it_is_of() -> None:
+    left, right = Scripted("left", 0.0), Scripted("right", 0.0)
+    right.remark = "3 state frames lost, 0 damaged"
+    hands = [hb.Grasp("left", left), hb.Grasp("right", right)]
+    with hb.Bridge(two_handed(BAR), hands, clock=clocked()) as bridge:
+        both = bridge.run(0.05)
+    assert [each.driver for each in both.hands] == ["", right.remark]
+    assert str(both).count(right.remark) == 1
+    with hb.Bridge("point_mass", right, clock=clocked()) as bridge:
+        assert f"driver              {right.remark}" in str(bridge.run(0.05))
 
 
 def test_a_device_without_news_is_flagged_alone(tmp_path: Path) -> None:

@@ -321,6 +321,9 @@ class Device(Protocol):
     A device with a grip axis returns two samples, the second that of the grip axis along x. If that
     axis is coupled, ``read`` gets two samples and ``write`` two wrenches, (2, 6); else one of each.
 
+    If a device has a ``remark``, a clause on frames that it lost or forces that it did not give,
+    the run's summary shows it; empty for nothing.
+
     An object with these calls can be given to a ``Bridge``. A package of its own selects it by a
     name (``guide/device_package.md``); ``testing.device_contract`` tests it.
 
@@ -472,6 +475,16 @@ class _Checked:
     def close(self) -> None:
         with telling(f"{self._of}: close"):
             self._device.close()
+
+    @property
+    def remark(self) -> str:
+        with telling(f"{self._of}: remark"):
+            return device_remark(self._device)
+
+
+def device_remark(device: Device) -> str:
+    """Returns a device's ``remark`` on lost frames and forces not given; empty without one."""
+    return str(getattr(device, "remark", ""))
 
 
 def device_fault(device: object) -> str:

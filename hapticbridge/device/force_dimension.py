@@ -302,7 +302,7 @@ class ForceDimensionDevice:
         self._place, self._gap = [c_double() for _ in range(3)], c_double()
         self._frame = (c_double * 9)()
         self._references = [byref(number) for number in self._place]
-        self.saturated = 0
+        self._limited = 0
         with calling_on_error(self.close):
             kind = dhd.require("dhdGetSystemType", self._id, what=what)
             model = MODELS.get(kind, Model(f"Force Dimension device of type {kind}"))
@@ -378,7 +378,7 @@ class ForceDimensionDevice:
             )
         self._send((0.0,) * 7)
         self._require("dhdEnableForce", 1)
-        self.saturated = 0
+        self._limited = 0
         begin = self._dhd.now()
         while self._get() == TIMEGUARD:
             if self._dhd.now() - begin > SILENCE:
@@ -414,7 +414,12 @@ class ForceDimensionDevice:
         values = [*wrench.ravel()[:7].tolist(), 0.0]
         if not all(map(math.isfinite, values)):
             raise DeviceError(f"{self._name}: a wrench that is not finite was not sent")
-        self.saturated += self._send(values) == SATURATED
+        self._limited += self._send(values) == SATURATED
+
+    @property
+    def remark(self) -> str:
+        """Number of forces that the SDK made smaller, as a clause; empty if there were none."""
+        return f"the SDK has limited {self._limited} forces" if self._limited else ""
 
     def close(self) -> None:
         """Commands zero force, switches the motors off and releases the device."""

@@ -374,9 +374,6 @@ class HaplyDevice:
         numbers: Numbers of the data sheet, by name.
         notify: Receives a description of the service's force filters.
 
-    Attributes:
-        held_back: Number of forces dropped because the service was slower than the loop.
-
     Raises:
         DeviceError: The service scales positions, or its answer is invalid.
         DeviceLost: The service is gone.
@@ -395,7 +392,7 @@ class HaplyDevice:
         self._link, self._listed = link, listed
         self._name = f"{listed.kind} {listed.device_id}"
         self._is_open, self._is_started = True, False
-        self._under_way = self.held_back = 0
+        self._under_way = self._overtaken = 0
         self._pending: tuple[float, ...] | None = None
         known: dict[str, Any] = {"force_limit": FORCE_LIMIT, **(numbers or {})}
         with calling_on_error(self.close):
@@ -440,7 +437,7 @@ class HaplyDevice:
                 f"{1 / MAX_PERIOD:g} Hz, not {1 / period:g} Hz"
             )
         self._take()
-        self._pending, self.held_back = None, 0
+        self._pending, self._overtaken = None, 0
         self._fill(self._exchange(force_message(self._listed, (0.0, 0.0, 0.0))))
         self._watch = SilenceDetector(self._link.now())
         self._is_started = True
@@ -472,9 +469,19 @@ class HaplyDevice:
         force = tuple(wrench[:3].tolist())
         if not all(map(math.isfinite, force)):
             raise DeviceError(f"{self._name}: a force that is not finite was not sent")
-        self.held_back += self._pending is not None
+        self._overtaken += self._pending is not None
         self._pending = force
         self._send_pending()
+
+    @property
+    def remark(self) -> str:
+        """Number of forces that a newer one overtook, as a clause; empty if there were none."""
+        return (
+            f"{self._overtaken} forces were not sent, because the service answers slower than the "
+            "loop asks"
+            if self._overtaken
+            else ""
+        )
 
     def close(self) -> None:
         """Commands zero force, waits up to ``SILENCE`` for the answer, and disconnects."""

@@ -21,7 +21,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.methods import METHODS, default_method, method_named
 from hapticbridge.device import Device, DeviceInfo
-from hapticbridge.device.base import checked
+from hapticbridge.device.base import checked, device_remark
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
 from hapticbridge.kernel.codes import Grip
 from hapticbridge.recording.format import MAX_HANDS
@@ -357,6 +357,11 @@ class DeviceGroup:
         self._wrench: object = None
         self._reading: list[tuple[int, Any, NDArray[np.int64] | None, Any]] = []
         self._writing: list[tuple[Any, NDArray[np.float64]]] = []
+
+    @property
+    def remarks(self) -> list[str]:
+        """Remarks of each hand's device (``device_remark``)."""
+        return [device_remark(device) for device, count, _ in self._devices for _ in range(count)]
 
     def real_ones(self) -> tuple[DeviceGroup, list[int]]:
         """Returns the real devices, of which there must be one, and the numbers of their hands."""

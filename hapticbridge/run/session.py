@@ -33,7 +33,7 @@ from hapticbridge.demand.probe import EVENT as PROBE_EVENT
 from hapticbridge.demand.probe import Probed, ProbedHand, probe_devices
 from hapticbridge.demand.trip import BY_TRIP, Trip, TripCode
 from hapticbridge.device import Device
-from hapticbridge.device.base import checked
+from hapticbridge.device.base import checked, device_remark
 from hapticbridge.device.own_loop import LoopDevice
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.kernel.codes import OK, RING_FULL
@@ -781,6 +781,10 @@ class Session:
             own_loop=None if self._own_loop is None else self._own_loop.tally.account,
             overlap=self.setup.scene.remaining_overlap(),
         )
+        device = self.device
+        remarks = (
+            device.remarks if isinstance(device, DeviceGroup) else [device_remark(self._calls)]
+        )
         hands = [
             Summary.from_state(
                 self.kernel.state[hand : hand + 1],
@@ -788,7 +792,7 @@ class Session:
                 setup.info,
                 setup.method,
                 setup.coupling,
-                replace(outcome, probed=self.probed[hand]),
+                replace(outcome, probed=self.probed[hand], driver=remarks[hand]),
             )
             for hand, setup in enumerate(self._setups)
         ]

@@ -162,6 +162,7 @@ class RunOutcome:
         probed: Result of the probe of the hand's device; None without one.
         own_loop: Account of a loop of the device's own; None without one.
         overlap: Pairs of the scene that began inside each other and still are; empty without any.
+        driver: What the hand's driver lost (``device_remark``), as a clause; empty for nothing.
     """
 
     ticks: int
@@ -176,6 +177,7 @@ class RunOutcome:
     probed: Probed | None = None
     own_loop: OwnLoopAccount | None = None
     overlap: str = ""
+    driver: str = ""
 
     def added_delay(self, info: DeviceInfo, period: float) -> float:
         """Returns the delay in s that the probe found beyond the stated one."""
@@ -201,6 +203,7 @@ _STORAGE = "scene's storage"
 
 _OF_A_HAND = (
     "probe",
+    "driver",
     "silence",
     "peak",
     "reach",
@@ -262,6 +265,7 @@ class Summary:
         trip: Stop by the guard; None without one.
         probe: Result of the probe of the device before the run, as a clause; empty without one.
         overlap: Pairs of the scene that began inside each other and still are; empty without any.
+        driver: What the driver lost of frames and forces, as a clause; empty for nothing.
         hands: Summary of each hand by itself, if several hold the scene. Fault, share of the slack
             and certification of the whole are then those of all of them.
     """
@@ -298,6 +302,7 @@ class Summary:
     trip: Trip | None = None
     probe: str = ""
     overlap: str = ""
+    driver: str = ""
     hands: tuple[Summary, ...] = ()
 
     def at_record(self, record: np.void) -> Summary:
@@ -437,6 +442,8 @@ class Summary:
         yield "overruns", f"{self.overruns}{skipped}, records dropped {self.dropped}"
         if self.probe:
             yield "probe", self.probe
+        if self.driver:
+            yield "driver", self.driver
         if own_loop := self.certification.own_loop:
             yield "device's loop", own_loop.words
         if remark := self.timekeeping.remark:
@@ -587,6 +594,7 @@ class Summary:
             trip=outcome.trip,
             probe=outcome.probed.words if outcome.probed else "",
             overlap=outcome.overlap,
+            driver=outcome.driver,
             grip=parameters.grip,
             device=info.name,
             pulses=(

@@ -239,7 +239,6 @@ class StateStream:
         report: Newest counters of the device's own loop; None before the first.
         lost: Number of missing state frames, by their sequence.
         damaged: Number of reports that were not valid frames.
-        repeated: Number of state frames that came twice.
     """
 
     def __init__(self, name: str, *, is_posed: bool = False) -> None:
@@ -247,7 +246,7 @@ class StateStream:
         self._half: LoopState | None = None
         self.newest: State | LoopState | None = None
         self.report: LoopReport | None = None
-        self.lost = self.damaged = self.repeated = 0
+        self.lost = self.damaged = 0
 
     def takes(self, report: bytes) -> bool:
         """Decodes a report; returns whether it was a new state frame.
@@ -276,7 +275,6 @@ class StateStream:
         last, self.newest = self.newest, state
         if last is not None:
             if state.sequence == last.sequence and state.time_us == last.time_us:
-                self.repeated += 1
                 return False
             if (state.time_us - last.time_us) & _HALF_A_TURN:
                 raise DeviceError(
@@ -408,7 +406,7 @@ class RawHidDevice:
         for report in self._link.take():
             is_new |= states.takes(report)
         if not self._has_begun:  # frames between the start and the loop do not count as lost
-            self._has_begun, states.lost = True, 0
+            self._has_begun, states.lost, states.damaged = True, 0, 0
         if self._watch.is_silent(self._now(), is_new=is_new):
             silence = 1e3 * self._watch.silence
             raise DeviceLost(f"{self._name} has sent nothing for {silence:.0f} ms; check its cable")
@@ -454,6 +452,12 @@ class RawHidDevice:
 
     def _end_force(self) -> None:
         self._send(force_frame(self._next(), NO_WRENCH, 1, is_enabled=False))
+
+    @property
+    def remark(self) -> str:
+        """Numbers of lost and damaged frames, as a clause; empty if there were none."""
+        lost, damaged = self.states.lost, self.states.damaged
+        return f"{lost} state frames lost, {damaged} damaged" if lost or damaged else ""
 
     @property
     def loop_state(self) -> LoopState | None:
