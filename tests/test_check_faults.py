@@ -632,6 +632,26 @@ def test_what_is_tied_to_the_tool_hangs_in_the_hand(
         assert all(each in told[0] for each in words)
 
 
+FOUR_BAR = """<body name="crank"><joint/><geom type="capsule" size=".02" fromto="0 0 0 0 .2 0"
+  mass=".2"/><body name="coupler" pos="0 .2 0"><joint/><geom type="capsule" size=".02"
+  fromto="0 0 0 .4 0 0" mass=".3"/><body name="rocker" pos=".4 0 0"><joint/><geom type="capsule"
+  size=".02" fromto="0 0 0 0 -.2 0" mass=".2"/><site name="grip" pos="0 -.1 0"/></body></body></body>"""
+"""A parallelogram in the plane of x and y; its weight along y is borne where it is closed."""
+
+
+@pytest.mark.parametrize("active", ["true", "false"])
+def test_the_weight_of_a_linkage_that_its_closed_loop_bears_is_not_the_hands(
+    tmp_path: Path, active: str
+) -> None:
+    option = GOOD_OPTION.replace('"0 0 0"', '"0 -9.81 0"')
+    loop = f'<equality><connect body1="rocker" anchor="0 -.2 0" active="{active}"/></equality>'
+    found = faults_in(tmp_path, mjcf(option, GOOD_CONTACT, loop, body=FOUR_BAR))
+    told = [fault.sentence for fault in found if fault.kind == "heavy tool"]
+    assert bool(told) == (active == "false")
+    if told:  # the rocker, and the coupler's end
+        assert f"carries {number((0.2 + 0.3 / 2) * 9.81)} N" in told[0]
+
+
 TWO_KINDS = """<geom name="wall" type="box" size="0.01 0.1 0.1" pos="0.06 0 0" {wall}/>
 <body name="tool"><freejoint/><site name="grip"/>
   <geom name="shell" type="box" size="0.02 0.02 0.02" mass="0.05" {shell}/>

@@ -76,8 +76,9 @@ _REMEDIES = {
         "force limit; with another reach in mind raise --stretch-limit"
     ),
     TripCode.TWISTED: (
-        "turn more slowly, raise --rotational-stiffness if the device bears it, or let the handle "
-        "slip on instead: --angle-limit inf"
+        "check how fast the hand turns, and springs or motors of the scene that turn the tool "
+        "beyond the torque limit; raise --rotational-stiffness if the device bears it, or let the "
+        "handle slip on instead: --angle-limit inf"
     ),
     TripCode.GAVE_ENERGY: "lower --stiffness",
     TripCode.DIVERGED: (
@@ -196,12 +197,16 @@ class Trip:
             created: Energy in J that the scene had created until then, which may be the cause.
             strongest: Name of the actuator that pushes most, or empty.
         """
+        least = max(0.5 * energy.net, INSTANT)
+        has_motors = energy.ratio * abs(energy.motors) > least
+        most = f" ('{strongest}' pushes most)" if strongest else ""
+        if self.code in (TripCode.STRETCHED, TripCode.TWISTED) and has_motors:
+            work = f"; the scene's motors {work_words(energy.motors)} until then{most}"
+            return _REMEDIES[self.code] + work
         if self.code == TripCode.GAVE_ENERGY:
-            least = max(0.5 * energy.net, INSTANT)
             if created > USUAL_ENERGY:
                 return _FIND_PUMP.format(format_energy(created))
-            if energy.ratio * abs(energy.motors) > least:
-                most = f" ('{strongest}' pushes most)" if strongest else ""
+            if has_motors:
                 return _LIMIT_MOTORS.format(work_words(energy.motors), most)
             if energy.ratio * abs(energy.inputs) > least:
                 return _LIMIT_INPUTS.format(work_words(energy.inputs))
