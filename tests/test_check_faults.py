@@ -635,7 +635,8 @@ def test_what_is_tied_to_the_tool_hangs_in_the_hand(
 FOUR_BAR = """<body name="crank"><joint/><geom type="capsule" size=".02" fromto="0 0 0 0 .2 0"
   mass=".2"/><body name="coupler" pos="0 .2 0"><joint/><geom type="capsule" size=".02"
   fromto="0 0 0 .4 0 0" mass=".3"/><body name="rocker" pos=".4 0 0"><joint/><geom type="capsule"
-  size=".02" fromto="0 0 0 0 -.2 0" mass=".2"/><site name="grip" pos="0 -.1 0"/></body></body></body>"""
+  size=".02" fromto="0 0 0 0 -.2 0" mass=".2"/><site name="grip" pos="0 -.1 0"/></body></body>
+  </body>"""
 """A parallelogram in the plane of x and y; its weight along y is borne where it is closed."""
 
 
@@ -1045,3 +1046,14 @@ def test_sensor_that_carries_the_grip_is_told_to_read_the_coupling(tmp_path: Pat
         "jointactuatorfrc 'of lift'",
     ]
     assert "'of lift' is of a joint that moves the grip" in told[2].sentence
+
+
+def test_a_contact_sensor_that_finds_contacts_ahead_is_told(tmp_path: Path) -> None:
+    sensors = """<sensor><contact name="touches" geom1="tip" data="found force" reduce="netforce"/>
+      <contact name="first" geom1="tip" data="force"/><touch site="grip"/>
+      <contact name="push" geom1="tip" data="force torque" reduce="netforce"/></sensor>"""
+    body = """<body name="tool"><freejoint/><geom name="tip" size="0.01" mass="0.05"/>
+      <site name="grip"/></body>"""
+    found = faults_in(tmp_path, mjcf(GOOD_OPTION, GOOD_CONTACT, sensors, body=body))
+    told = [fault.place.element for fault in found if fault.kind == "contact sensor"]
+    assert told == ["contact 'touches'", "contact 'first'"]
