@@ -632,6 +632,27 @@ def test_what_is_tied_to_the_tool_hangs_in_the_hand(
         assert all(each in told[0] for each in words)
 
 
+FOUR_BAR = """<body name="crank"><joint/><geom type="capsule" size=".02" fromto="0 0 0 0 .2 0"
+  mass=".2"/><body name="coupler" pos="0 .2 0"><joint/><geom type="capsule" size=".02"
+  fromto="0 0 0 .4 0 0" mass=".3"/><body name="rocker" pos=".4 0 0"><joint/><geom type="capsule"
+  size=".02" fromto="0 0 0 0 -.2 0" mass=".2"/><site name="grip" pos="0 -.1 0"/></body></body>
+  </body>"""
+"""A parallelogram in the plane of x and y; its weight along y is borne where it is closed."""
+
+
+@pytest.mark.parametrize("active", ["true", "false"])
+def test_the_weight_of_a_linkage_that_its_closed_loop_bears_is_not_the_hands(
+    tmp_path: Path, active: str
+) -> None:
+    option = GOOD_OPTION.replace('"0 0 0"', '"0 -9.81 0"')
+    loop = f'<equality><connect body1="rocker" anchor="0 -.2 0" active="{active}"/></equality>'
+    found = faults_in(tmp_path, mjcf(option, GOOD_CONTACT, loop, body=FOUR_BAR))
+    told = [fault.sentence for fault in found if fault.kind == "heavy tool"]
+    assert bool(told) == (active == "false")
+    if told:  # the rocker, and the coupler's end
+        assert f"carries {number((0.2 + 0.3 / 2) * 9.81)} N" in told[0]
+
+
 TWO_KINDS = """<geom name="wall" type="box" size="0.01 0.1 0.1" pos="0.06 0 0" {wall}/>
 <body name="tool"><freejoint/><site name="grip"/>
   <geom name="shell" type="box" size="0.02 0.02 0.02" mass="0.05" {shell}/>
@@ -1025,3 +1046,14 @@ def test_sensor_that_carries_the_grip_is_told_to_read_the_coupling(tmp_path: Pat
         "jointactuatorfrc 'of lift'",
     ]
     assert "'of lift' is of a joint that moves the grip" in told[2].sentence
+
+
+def test_a_contact_sensor_that_finds_contacts_ahead_is_told(tmp_path: Path) -> None:
+    sensors = """<sensor><contact name="touches" geom1="tip" data="found force" reduce="netforce"/>
+      <contact name="first" geom1="tip" data="force"/><touch site="grip"/>
+      <contact name="push" geom1="tip" data="force torque" reduce="netforce"/></sensor>"""
+    body = """<body name="tool"><freejoint/><geom name="tip" size="0.01" mass="0.05"/>
+      <site name="grip"/></body>"""
+    found = faults_in(tmp_path, mjcf(GOOD_OPTION, GOOD_CONTACT, sensors, body=body))
+    told = [fault.place.element for fault in found if fault.kind == "contact sensor"]
+    assert told == ["contact 'touches'", "contact 'first'"]

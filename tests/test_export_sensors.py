@@ -6,6 +6,7 @@ import csv
 from pathlib import Path
 
 import h5py
+import mujoco
 import numpy as np
 import pyarrow.parquet
 import pytest
@@ -13,6 +14,7 @@ from cli_cases import Called
 
 import hapticbridge as hb
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.replay.film import Shot
 from hapticbridge.tools.dataset import write_dataset
 from hapticbridge.tools.export import Part, export
 
@@ -138,8 +140,38 @@ def test_readings_that_include_the_coupling_are_told(tmp_path: Path, call: Calle
     assert read_table(table, "sensor_at wrist_2")[1] == pytest.approx(0.2 * 9.81, rel=0.02)
     assert read_table(table, "sensor_motor")[1] == pytest.approx(0.1 * 9.81, rel=0.02)
     done = write_dataset([file], "robomimic", tmp_path / "set")
-    assert list(done.coupled) == COUPLED
+    assert done.odd["coupled"] == COUPLED
     _, _, told = call("export", file, "--format", "lerobot", "--out", tmp_path / "other")
     assert "'motor': these readings include the coupling's pull" in " ".join(told.split())
     _, _, told = call("export", file, "--format", "csv", "--out", tmp_path / "plain.csv")
     assert "readings" not in told
+
+
+HOVERING = """<mujoco model="hovering"><option timestep="0.001"/><worldbody>
+<geom name="floor" type="plane" size="1 1 .1"/><body name="foot" pos="0 0 .0203" gravcomp="1">
+<freejoint/><geom name="foot" type="box" size=".02 .02 .02" mass=".1"/><site name="grip"/></body>
+</worldbody><sensor><contact name="touches" geom1="foot" geom2="floor" data="found force"
+reduce="netforce"/><contact name="push" geom1="foot" geom2="floor" data="force" reduce="netforce"/>
+</sensor></mujoco>"""
+"""A tool 0.3 mm above the floor, which the file's own contacts do not find."""
+
+
+def test_readings_of_contacts_that_are_seen_ahead_are_told(tmp_path: Path, call: Called) -> None:
+    model = mujoco.MjModel.from_xml_string(HOVERING)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert not data.sensordata.any()
+    (tmp_path / "hovering.xml").write_text(HOVERING)
+    file, table = tmp_path / "run.mcap", tmp_path / "run.csv"
+    place, clock = tmp_path / "hovering.xml", hb.SimulatedClock()
+    with hb.Bridge(place, "simulated:hand=none", clock=clock, recording=file) as bridge:
+        bridge.run(duration=0.1)
+    _, _, told = call("export", file, "--format", "csv", "--sensors", "--out", table)
+    columns = ", ".join(f"'sensor_touches_{k}'" for k in range(4))
+    assert f"{columns}: these readings find contacts that the run sees ahead" in " ".join(
+        told.split()
+    )
+    assert read_table(table, "sensor_touches_0")[-1] == 4  # a box on a plane
+    assert not any(read_table(table, f"sensor_push_{k}").any() for k in range(3))
+    done = write_dataset([file], "robomimic", tmp_path / "set", Shot(fps=100))
+    assert done.odd == {"coupled": [], "early": [f"touches_{k}" for k in range(4)]}

@@ -573,3 +573,8 @@ def test_run_and_audit_charge_a_late_sample_for_each_of_its_ticks(tmp_path: Path
     assert kept is not None
     assert summary.timekeeping.delay_energy > 0.0
     assert kept.delay_energy == pytest.approx(summary.timekeeping.delay_energy, rel=1e-6)
+
+
+@pytest.mark.parametrize("alarm", timekeeping.Alarm)
+def test_the_watch_names_a_hand_that_shakes_among_the_causes(alarm: timekeeping.Alarm) -> None:
+    assert "the hand shook it faster than 8 Hz" in alarm.sentence

@@ -7,6 +7,7 @@ import pytest
 from hapticbridge.demand.trip import Trip, TripCode
 from hapticbridge.errors import RecordingError
 from hapticbridge.kernel import codes
+from hapticbridge.kernel.hand_energy import HandEnergy
 
 TRIPS = (
     Trip(TripCode.JUMPED, 5),
@@ -45,3 +46,15 @@ UNSOUND = (
     *(TripCode.CONTACTS_FULL, TripCode.CONSTRAINTS_FULL),
     *(TripCode.DIVERGED, TripCode.SIMULATION),
 )
+
+
+@pytest.mark.parametrize("code", [TripCode.STRETCHED, TripCode.TWISTED])
+def test_a_tool_that_was_pushed_away_is_not_blamed_on_the_hand_alone(code: TripCode) -> None:
+    remedy = Trip(code, 3).remedy(HandEnergy(motors=33.8e3), strongest="crank")
+    assert "springs, motors or inputs of the scene" in remedy
+    assert remedy.endswith("motors did 33.8 kJ of work until then ('crank' pushes most)")
+    applied = Trip(code, 3).remedy(HandEnergy(inputs=112.0))
+    assert applied.endswith(
+        "(applied forces, moved mocap bodies, belts) did 112 J of work until then"
+    )
+    assert "until then" not in Trip(code, 3).remedy(HandEnergy(net=0.01))

@@ -22,7 +22,13 @@ from hapticbridge.check.run_faults import run_faults
 from hapticbridge.errors import choices
 from hapticbridge.run.fidelity import fidelity
 from hapticbridge.scene import compile_scene
-from hapticbridge.scene.checks import MAY_BE_ACTIVE, coupled_sensors, first_pump, unmetered_work
+from hapticbridge.scene.checks import (
+    MAY_BE_ACTIVE,
+    coupled_sensors,
+    early_sensors,
+    first_pump,
+    unmetered_work,
+)
 from hapticbridge.scene.compile import START_KEYFRAME, start_among
 from hapticbridge.scene.fault import Fault
 from hapticbridge.scene.first_faults import (
@@ -126,7 +132,7 @@ def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:
 
 
 def sensor_faults(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Yields sensors that read the coupling's pull (``coupled_sensors``)."""
+    """Yields sensors that read the coupling's pull or contacts ahead, as in ``checks``."""
     model = case.model
     for sensor in coupled_sensors(model, case.scene.grip):
         name, tag = str(model.sensor(sensor).name), _FORCE_SENSORS[int(model.sensor_type[sensor])]
@@ -142,6 +148,15 @@ def sensor_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             f"sensor '{name or sensor}' {place}: its readings include {pull}, which MuJoCo takes "
             "for a motor's, and a real sensor there would not",
             mend,
+        )
+    for sensor in early_sensors(model):
+        name = str(model.sensor(sensor).name)
+        yield Fault(
+            "contact sensor",
+            case.places.named("contact", name),
+            f"sensor '{name or sensor}' also finds contacts that a run sees ahead, some mm before "
+            "the parts touch; they carry no force",
+            'nothing; or data="force" reduce="netforce", which is 0 until they touch',
         )
 
 

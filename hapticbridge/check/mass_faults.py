@@ -157,7 +157,7 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     """Computes sag and droop below the handle: (JᵀKJ + K_springs + K_servos) δq = the weight.
 
     Bodies of other trees that active welds and connects tie to the tool hang on it: A δq = 0 with
-    the Jacobian A of these equalities.
+    the Jacobian A of these equalities, and of those that close a loop within the tool.
     """
     model, scene = case.model, case.scene
     scene.reset()
@@ -177,7 +177,7 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     stiffness = tool_jacobian.T @ (gains[:, None] * tool_jacobian)
     pulls = (data.qfrc_gravcomp - bias)[dofs]
     stiffness += stiffness_without_hand(model, data, dofs, has_weight=False)
-    free = _unconstrained(model, data, dofs) if tied else np.eye(dofs.size)
+    free = _unconstrained(model, data, dofs)
     moved = free @ np.linalg.lstsq(free.T @ stiffness @ free, free.T @ pulls, rcond=1e-9)[0]
     sag, droop = map(float, np.linalg.norm((tool_jacobian @ moved).reshape(2, 3), axis=1))
     parts = []
@@ -213,14 +213,17 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
 def _unconstrained(
     model: mujoco.MjModel, data: mujoco.MjData, dofs: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Returns directions (n, m) of the dofs that satisfy all equalities of the start."""
+    """Returns directions (n, m) of the dofs that satisfy the equalities among them at the start."""
     mujoco.mj_fwdPosition(model, data)
     rows = np.zeros((data.nefc, model.nv))
     for row in range(data.nefc):
         unit = np.zeros(data.nefc)
         unit[row] = 1.0
         mujoco.mj_mulJacTVec(model, data, rows[row], unit)
-    is_equality = data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
-    _, sizes, axes = np.linalg.svd(rows[is_equality][:, dofs])
+    is_among = ~np.delete(rows, dofs, axis=1).any(axis=1)
+    is_among &= data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+    if not is_among.any():
+        return np.eye(dofs.size)
+    _, sizes, axes = np.linalg.svd(rows[is_among][:, dofs])
     rank = int(np.sum(sizes > 1e-9 * sizes.max(initial=0.0)))
     return np.asarray(axes[rank:].T)

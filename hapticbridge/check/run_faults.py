@@ -34,7 +34,7 @@ def run_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             "motion not finished",
             option("timestep"),
             f"under {case.motion_name}: {case.motion_fault}",
-            "mend what is named here and the faults above first; if there is nothing, a softer "
+            "mend the other findings first, a motor that pushes too; if there is none, a softer "
             "contact or a heavier tool",
         )
         return

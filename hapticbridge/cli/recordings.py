@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -192,14 +193,14 @@ class Export:
             facts = {"files": [str(file) for file in done.files], "ticks": done.ticks}
             facts |= {"marks": marks, "is_cut": bool(recording.cut_sentence)}
             facts |= {"cut": recording.cut_sentence, "damage": recording.problems}
-            facts |= {"coupled": done.coupled}
+            facts |= {why: done.odd.get(why, []) for why in _ODD}
             print_json(facts)
         else:
             names = ", ".join(plain(str(file)) for file in done.files)
             out.print(f"wrote {names}: {done.ticks} ticks, {len(done.events)} events")
             if marks:
                 out.print(f"marks at {', '.join(f'{time:.3f} s' for time in marks)}")
-        _tell_coupled(done.coupled)
+        _tell_odd(done.odd)
         if recording.cut_sentence:
             err.print(f"[yellow]warning:[/yellow] {recording.cut_sentence}; this is what it holds")
         if recording.problems:
@@ -223,12 +224,14 @@ class Export:
                 self.files, self.form, self.out or self.form, shot, task=self.task, progress=show
             )
         if self.as_json:
-            print_json(asdict(done) | {"folder": str(done.folder)})
+            facts = asdict(done) | {"folder": str(done.folder)}
+            del facts["odd"]
+            print_json(facts | done.odd)
         else:
             frames = f"{sum(done.episodes)} frames at {shot.fps} Hz"
             episodes = format_count(len(done.episodes), "episode")
             out.print(f"wrote {plain(str(done.folder))}: {episodes}, {frames}")
-        _tell_coupled(done.coupled)
+        _tell_odd(done.odd)
         for file, resets, end in zip(self.files, done.resets, done.ends, strict=True):
             if end:
                 told = plain(f"{file}: {end}; look at its episode")
@@ -249,14 +252,24 @@ def _tell_faults(recording: RecordingFile) -> None:
         err.print(f"[yellow]warning:[/yellow] {told}")
 
 
-def _tell_coupled(names: tuple[str, ...]) -> None:
-    """Prints which readings of sensors include the coupling's pull on the tool."""
-    if names:
-        err.print(
-            f"[yellow]warning:[/yellow] {plain(choices(names))}: these readings include the "
-            "coupling's pull on the tool, which MuJoCo takes for a motor's, and a real sensor "
-            "there would not; 'hapticbridge check' says what to subtract"
-        )
+_ODD = {
+    "coupled": (
+        "these readings include the coupling's pull on the tool, which MuJoCo takes for a motor's, "
+        "and a real sensor there would not; 'hapticbridge check' says what to subtract"
+    ),
+    "early": (
+        "these readings find contacts that the run sees ahead, some mm before the parts touch; "
+        "such a contact carries no force, by which it is told from one that touches"
+    ),
+}
+"""Sentences on readings that the file alone would not give, by the reason."""
+
+
+def _tell_odd(readings: Mapping[str, list[str]]) -> None:
+    """Prints which readings of sensors the file alone would not give, and why."""
+    for why, names in readings.items():
+        if names:
+            err.print(f"[yellow]warning:[/yellow] {plain(choices(names))}: {_ODD[why]}")
 
 
 @dataclass(frozen=True, slots=True)

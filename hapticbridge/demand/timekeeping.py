@@ -147,13 +147,14 @@ class Alarm(StrEnum):
         if self is Alarm.RUNS_AWAY:
             return (
                 "the force was taken away because the device did not move as it was pushed: an "
-                "axis is reversed or exchanged (check the axes and signs of the device) or the "
-                "force comes very late"
+                "axis is reversed or exchanged (check the axes and signs of the device), the force "
+                "comes very late, or the hand shook it faster than 8 Hz"
             )
         return (
             "the force was lowered because the device swung: it answered late, or in coarse "
-            "steps, or an axis is reversed; check the signs of its axes, lower --stiffness, "
-            "and measure its delay and resolution ('hapticbridge identify')"
+            "steps, an axis is reversed, or the hand shook it faster than 8 Hz; check the signs of "
+            "its axes, lower --stiffness, and measure its delay and resolution ('hapticbridge "
+            "identify')"
         )
 
 

@@ -72,12 +72,13 @@ _REMEDIES = {
     ),
     TripCode.STRETCHED: (
         "check the motion's unit (m) and speed, the tool's mass (--no-tool-weight carries a tool "
-        "that falls or tips over), and springs or motors of the scene that push it beyond the "
-        "force limit; with another reach in mind raise --stretch-limit"
+        "that falls or tips over), and springs, motors or inputs of the scene that push it beyond "
+        "the force limit; with another reach in mind raise --stretch-limit"
     ),
     TripCode.TWISTED: (
-        "turn more slowly, raise --rotational-stiffness if the device bears it, or let the handle "
-        "slip on instead: --angle-limit inf"
+        "check how fast the hand turns, and springs, motors or inputs of the scene that turn the "
+        "tool beyond the torque limit; raise --rotational-stiffness if the device bears it, or let "
+        "the handle slip on instead: --angle-limit inf"
     ),
     TripCode.GAVE_ENERGY: "lower --stiffness",
     TripCode.DIVERGED: (
@@ -94,9 +95,10 @@ _LIMIT_MOTORS = (
     "those that push at the start; if they are meant to push the hand, --energy-limit is what it "
     "may get"
 )
+_INPUTS = "inputs (applied forces, moved mocap bodies, belts)"
 _LIMIT_INPUTS = (
-    "the scene's inputs (applied forces, moved mocap bodies, belts) {} until then: make them "
-    "smaller or slower; if they are meant to push the hand, --energy-limit is what it may get"
+    f"the scene's {_INPUTS} {{}} until then: make them smaller or slower; if they are meant to "
+    "push the hand, --energy-limit is what it may get"
 )
 _EASE_SPRINGS = (
     "the coupling's springs held {} at the start or after resets, by what the tool bears: "
@@ -196,14 +198,23 @@ class Trip:
             created: Energy in J that the scene had created until then, which may be the cause.
             strongest: Name of the actuator that pushes most, or empty.
         """
+        least = max(0.5 * energy.net, INSTANT)
+        has_motors = energy.ratio * abs(energy.motors) > least
+        has_inputs = energy.ratio * abs(energy.inputs) > least
+        most = f" ('{strongest}' pushes most)" if strongest else ""
+        if self.code in (TripCode.STRETCHED, TripCode.TWISTED):
+            remedy = _REMEDIES[self.code]
+            if has_motors:
+                remedy += f"; the scene's motors {work_words(energy.motors)} until then{most}"
+            if has_inputs:
+                remedy += f"; the scene's {_INPUTS} {work_words(energy.inputs)} until then"
+            return remedy
         if self.code == TripCode.GAVE_ENERGY:
-            least = max(0.5 * energy.net, INSTANT)
             if created > USUAL_ENERGY:
                 return _FIND_PUMP.format(format_energy(created))
-            if energy.ratio * abs(energy.motors) > least:
-                most = f" ('{strongest}' pushes most)" if strongest else ""
+            if has_motors:
                 return _LIMIT_MOTORS.format(work_words(energy.motors), most)
-            if energy.ratio * abs(energy.inputs) > least:
+            if has_inputs:
                 return _LIMIT_INPUTS.format(work_words(energy.inputs))
             if (
                 energy.ratio * energy.springs > least

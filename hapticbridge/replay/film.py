@@ -178,8 +178,8 @@ def states(recording: Path, shot: Shot, progress: Progress | None = None) -> dic
 
     Returns:
         ``rows`` (records, (n,)), ``qpos`` (n, nq), ``qvel`` (n, nv), ``ctrl`` (n, nu), ``sensors``,
-        ``names`` of positions, ``controls`` of ``ctrl``, ``sensor_names``, ``coupled_readings`` as
-        of ``SensorValues``, and with a camera ``pictures``, a PNG each.
+        ``names`` of positions, ``controls`` of ``ctrl``, ``sensor_names``, ``odd_readings`` as of
+        ``SensorValues``, and with a camera ``pictures``, a PNG each.
 
     Raises:
         HapticBridgeError: As ``draw``.
@@ -199,13 +199,14 @@ class SensorValues(NamedTuple):
         names: Name of each number (k,).
         ticks: Number of each tick (n,), increasing.
         values: The readings (n, k), in MuJoCo's units.
-        coupled: Names of those numbers that include the coupling's pull on the tool.
+        odd: Names of those numbers that the file alone would not give, by the reason: ``coupled``
+            and ``early``, as of ``Stage.odd_readings``.
     """
 
     names: tuple[str, ...]
     ticks: NDArray[np.int64]
     values: NDArray[np.float64]
-    coupled: tuple[str, ...]
+    odd: dict[str, list[str]]
 
 
 def sensors(recording: Path) -> SensorValues:
@@ -221,7 +222,7 @@ def sensors(recording: Path) -> SensorValues:
         raise HapticBridgeError(f"the scene of '{recording}' has no sensors")
     ticks = np.frombuffer(found["ticks"], np.int64)
     values = np.frombuffer(found["values"]).reshape(len(ticks), -1)
-    return SensorValues(names, ticks, values, tuple(found["coupled"]))
+    return SensorValues(names, ticks, values, found["odd"])
 
 
 def still(recording: str | Path, shot: Shot, *, in_process: bool = False) -> bytes:
@@ -413,7 +414,7 @@ def _states(path: Path, shot: Shot, worker: Worker) -> dict[str, Any]:
         "ctrl": ctrl,
         "sensors": np.array(readings),
         "sensor_names": sensor_names(model),
-        "coupled_readings": stage.coupled_readings(),
+        "odd_readings": stage.odd_readings(),
         "names": names,
         "controls": list(controls.values()),
         "pictures": pictures,
@@ -446,7 +447,7 @@ def _sensors(path: Path, worker: Worker) -> dict[str, Any]:
         "names": names,
         "ticks": np.array(ticks).tobytes(),
         "values": b"".join(values),
-        "coupled": stage.coupled_readings(),
+        "odd": stage.odd_readings(),
     }
 
 

@@ -23,7 +23,7 @@ from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
 from hapticbridge.recording.ring import MAX_CONTACTS
 from hapticbridge.replay.blow import NewestBlow, newest_blow
-from hapticbridge.scene.checks import coupled_sensors
+from hapticbridge.scene.checks import coupled_sensors, early_sensors
 
 PLACE = 1e-4
 """Largest distance in m between the tool, simulated again, and its record. It is less than a pixel.
@@ -269,14 +269,24 @@ class Stage:
         """Grips of the hands; a joint has no place in the scene."""
         return tuple(own.grip for own in self._hands if not own.is_joint)
 
-    def coupled_readings(self) -> list[str]:
-        """Returns the names of the sensors' numbers that include the coupling's pull."""
+    def odd_readings(self) -> dict[str, list[str]]:
+        """Returns the names of the sensors' numbers that are not what the file alone would give.
+
+        Those of ``coupled`` include the coupling's pull, those of ``early`` contacts seen ahead.
+        """
         names, model = sensor_names(self.model), self.model
-        return [
-            names[int(model.sensor_adr[sensor]) + k]
-            for sensor in coupled_sensors(model, *(own.grip for own in self._hands))
-            for k in range(int(model.sensor_dim[sensor]))
-        ]
+        odd = {
+            "coupled": coupled_sensors(model, *(own.grip for own in self._hands)),
+            "early": early_sensors(model),
+        }
+        return {
+            why: [
+                names[int(model.sensor_adr[sensor]) + k]
+                for sensor in sensors
+                for k in range(int(model.sensor_dim[sensor]))
+            ]
+            for why, sensors in odd.items()
+        }
 
     def hands(self) -> Iterator[tuple[NDArray[np.void], NDArray[np.float64]]]:
         """Yields the record (1,) of each hand at a grip, and the force on it in N, (3,)."""

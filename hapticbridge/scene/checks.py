@@ -470,6 +470,23 @@ def coupled_sensors(model: mujoco.MjModel, *grips: str) -> list[int]:
     ]
 
 
+def early_sensors(model: mujoco.MjModel) -> list[int]:
+    """Returns the sensors that find contacts which a run sees ahead, before the parts touch.
+
+    Such a contact carries no force. A sensor that reads forces alone, and not of the contacts that
+    happen to be the first (``reduce="none"``), leaves it out.
+    """
+    kinds = mujoco.mjtConDataField.mjCONDATA_FORCE, mujoco.mjtConDataField.mjCONDATA_TORQUE
+    forces = sum(1 << int(kind) for kind in kinds)
+    return [
+        sensor
+        for sensor, (kind, (data, reduction, *_)) in enumerate(
+            zip(model.sensor_type.tolist(), model.sensor_intprm.tolist(), strict=True)
+        )
+        if kind == mujoco.mjtSensor.mjSENS_CONTACT and (data & ~forces or reduction == 0)
+    ]
+
+
 def _check_coupling_actuator(model: mujoco.MjModel, name: str) -> None:
     actuator_id = model.actuator(name).id
     is_as_set = (

@@ -32,6 +32,7 @@ FAILS = {
     "workspace": True,
     "box edges": False,
     "changed": False,
+    "contact sensor": False,
     "creeping friction": False,
     "default contact": False,
     "density of water": False,

@@ -73,7 +73,7 @@ class Episode:
         names: Names of the k numbers, by name.
         states: ``qpos`` and ``qvel`` in a row, (n, nq + nv).
         pictures: PNG of each frame; none without a camera.
-        coupled: Names of those readings of sensors that include the coupling's pull on the tool.
+        odd: Names of those readings of sensors that the file alone would not give, by the reason.
     """
 
     name: str
@@ -82,7 +82,7 @@ class Episode:
     names: Mapping[str, tuple[str, ...]]
     states: NDArray[np.float64]
     pictures: tuple[bytes, ...] = field(repr=False)
-    coupled: tuple[str, ...] = ()
+    odd: Mapping[str, list[str]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.states)
@@ -151,7 +151,7 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
         names=names,
         states=np.concatenate([found["qpos"], found["qvel"]], axis=1)[:-1],
         pictures=tuple(found["pictures"][:count]),
-        coupled=tuple(found["coupled_readings"]),
+        odd=found["odd_readings"],
     )
 
 
@@ -463,14 +463,14 @@ class WrittenDataset:
         episodes: Number of frames of each episode.
         resets: Times in s within each episode at which the scene was reset, so that it jumps.
         ends: What ended each episode's run, as a clause; empty for an ordinary end.
-        coupled: Names of those readings of sensors that include the coupling's pull on the tool.
+        odd: Names of those readings of sensors that the file alone would not give, by the reason.
     """
 
     folder: Path
     episodes: tuple[int, ...]
     resets: tuple[tuple[float, ...], ...]
     ends: tuple[str, ...]
-    coupled: tuple[str, ...]
+    odd: dict[str, list[str]]
 
 
 def write_dataset(
@@ -520,7 +520,7 @@ def write_dataset(
             f"the recordings are of the scenes {choices(scenes)}, and one's name is no task for "
             "all; say with --task what was done"
         )
-    draft, counts, coupled = draft_of(folder), [], dict[str, None]()
+    draft, counts, odd = draft_of(folder), [], dict[str, list[str]]()
     try:
         shutil.rmtree(draft, ignore_errors=True)
         draft.mkdir()
@@ -529,7 +529,8 @@ def write_dataset(
             for episode in _episodes(recordings, shot, progress):
                 writer.add(episode)
                 counts.append(len(episode))
-                coupled |= dict.fromkeys(episode.coupled)
+                for why, names in episode.odd.items():
+                    odd[why] = list(dict.fromkeys([*odd.get(why, []), *names]))
             writer.finish()
         draft.rename(folder)
     except OSError as error:
@@ -538,7 +539,7 @@ def write_dataset(
         shutil.rmtree(draft, ignore_errors=True)
     ends = (unusual_end(Trip.among(each.events), each.events) for each in recordings)
     resets = tuple(map(_resets, recordings))
-    return WrittenDataset(folder, tuple(counts), resets, tuple(ends), tuple(coupled))
+    return WrittenDataset(folder, tuple(counts), resets, tuple(ends), odd)
 
 
 def _placings(recording: RecordingFile) -> list[Mapping[str, Any]]:

@@ -444,7 +444,9 @@ class _ColumnsWithSensors(TableColumns):
         self._sensors = sensors(recording.path)
         self.units |= {f"sensor_{name}": "MuJoCo's" for name in self._sensors.names}
         self.kinds += ["f"] * len(self._sensors.names)
-        self.coupled = tuple(f"sensor_{name}" for name in self._sensors.coupled)
+        self.odd = {
+            why: [f"sensor_{name}" for name in names] for why, names in self._sensors.odd.items()
+        }
 
     def values(self, ticks: NDArray[np.void]) -> list[NDArray[Any]]:
         """Returns the columns of some records, each contiguous, (n,), int64 or float64."""
@@ -467,14 +469,14 @@ class Exported:
         recording: The recording without its ticks.
         ticks: Count of rows in the table.
         events: Events that were written.
-        coupled: Columns of sensors whose readings include the coupling's pull on the tool.
+        odd: Columns of sensors whose readings the file alone would not give, by the reason.
     """
 
     files: tuple[Path, ...]
     recording: RecordingFile
     ticks: int
     events: tuple[dict[str, Any], ...]
-    coupled: tuple[str, ...] = ()
+    odd: Mapping[str, list[str]]
 
 
 def target_for(path: str | Path, form: str) -> Path:
@@ -550,8 +552,8 @@ def export(
         for written in drafts:
             with suppress(OSError):
                 written.unlink(missing_ok=True)
-    coupled = columns.coupled if isinstance(columns, _ColumnsWithSensors) else ()
-    return Exported(files, recording, count, tuple(piece.events), coupled)
+    odd = columns.odd if isinstance(columns, _ColumnsWithSensors) else {}
+    return Exported(files, recording, count, tuple(piece.events), odd)
 
 
 def time_of(event: Mapping[str, Any]) -> float:
