@@ -202,7 +202,7 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     yield Fault(
         "heavy tool",
         case.places.find("body", int(of_tool[0])),  # the first that moves
-        f"{what} weighs {weight(mass)}; where no contact, limit, dry friction or "
+        f"{what} weighs {weight(mass)}; where no contact, limit, equality, dry friction or "
         f"motor carries it, the hand carries {' and '.join(parts)} at rest; a run carries it where "
         "the device cannot, and with --no-tool-weight",
         f'gravcomp="1" in {where}, or less mass'
