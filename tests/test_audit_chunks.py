@@ -276,6 +276,8 @@ def test_damage_that_takes_the_metadata_along_is_the_reason(
     assert (report.verdict, report.duration) == ("invalid", 0.0)
     assert report.reason.startswith("the file is damaged: nothing can be read from byte 8 to byte")
     assert report.reason.endswith("the metadata record 'hapticbridge' is missing")
+    _, printed, _ = call("audit", path)
+    assert printed.splitlines()[-1] == f"  {report.ticks} ticks"  # its period is unknown
     scene = "virtual_wall"
     for words in (
         ("render", path, tmp_path / "x.png"),

@@ -33,11 +33,16 @@ TYPES = get_typestore(Stores.ROS2_JAZZY)
 TURN = np.array([0.1, -0.2, 0.3, np.sqrt(1 - 0.14)])  # x, y, z, w, as ROS writes them
 
 
-def pose_message(time: int, place: float, kind: str = "geometry_msgs/msg/PoseStamped") -> bytes:
+def pose_message(
+    time: int,
+    place: float,
+    kind: str = "geometry_msgs/msg/PoseStamped",
+    frame: str = "world of a long name",
+) -> bytes:
     """Returns a message with a stamp in ns and a place on the x axis in m."""
     new = TYPES.types.__getitem__
     stamp = new("builtin_interfaces/msg/Time")(*divmod(time, 10**9))
-    header = new("std_msgs/msg/Header")(stamp, "world of a long name")
+    header = new("std_msgs/msg/Header")(stamp, frame)
     if kind.endswith("TwistStamped"):
         zero = new("geometry_msgs/msg/Vector3")(0.0, 0.0, 0.0)
         message = new(kind)(header, new("geometry_msgs/msg/Twist")(zero, zero))
@@ -241,6 +246,14 @@ def test_a_bag_of_another_kind_is_told_with_what_reads_it(
     assert ("only what 'hapticbridge run' wrote is a recording" in told) == (
         "a bag of" in words + told
     )
+
+
+def test_poses_of_two_frames_on_one_topic_are_refused(tmp_path: Path) -> None:
+    """Two programs publish there; their poses are no one motion."""
+    frames = ["map", "odom"]
+    poses = [(at, pose_message(at, 0.0, frame=frames[at % 2])) for at in range(1, 9)]
+    with pytest.raises(DeviceError, match=r"/hand are in 2 frames, 'map', 'odom'; write"):
+        read_bag(next(bag(tmp_path / "bag", {"/hand": poses}).glob("*.mcap")))
 
 
 def test_a_bag_that_compresses_each_message_is_told(tmp_path: Path) -> None:

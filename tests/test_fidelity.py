@@ -88,6 +88,8 @@ def test_contacts_are_named_where_they_are_the_cause_and_undone_where_that_mends
     assert (ball.body, Cause.CONTACT in found.causes) == ("ball", True)
     assert ball.apart == pytest.approx(ball.moved, rel=0.1) and ball.moved > 1e-3
     assert found.remedy == RunPoint(NO_HAND, PERIOD, contact="scene")
+    nameless = str(moved(scene(tmp_path, SINKING.replace(' name="ball"', ""))))
+    assert "the contact of body 'world' and body '1'" in nameless
     assert "--contact scene (tried: " in found.advice(RunPoint(NO_HAND, PERIOD))
     assert "rigid contacts in place of the file's own" in str(found)
 

@@ -277,7 +277,8 @@ def mcap_with(topic: str, schema: str, text: bytes, **meta: str) -> bytes:
     [
         (b"", "is empty"),
         (b"t,x,y,z\n0,0,0,0\n", "not an MCAP file"),
-        (mcap_with("/imu", "sensor_msgs/msg/Imu", b"int64 a"), "no topic /tick"),
+        (mcap_with("/imu", "sensor_msgs/msg/Imu", b"int64 a"), "no topic /tick$"),
+        (mcap_with("/tf", "tf/tfMessage", b"int64 a"), "no topic /tick$"),  # and no damage
         (mcap_with("/tick", "other/msg/Tick", b"int64 a"), "has the schema 'other/msg/Tick'"),
         (mcap_with("/tick", "hapticbridge/msg/Tick", b"int64 tick"), "has other fields"),
         (mcap_with("/tick", "hapticbridge/msg/Tick", b"int64 tick", format="0"), "format '0'"),

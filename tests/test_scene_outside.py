@@ -387,6 +387,25 @@ def test_heavy_pole_that_topples_in_the_hand_is_carried(
             pass
 
 
+def test_hovering_quadrotor_does_not_topple(tmp_path: Path) -> None:
+    """Thrust turns with the tool, so a tilt makes it drift, ever faster but not exponentially."""
+    arms = [(0.1, 0.1), (-0.1, 0.1), (-0.1, -0.1), (0.1, -0.1)]
+    sites = "".join(f'<site name="r{i}" pos="{x} {y} 0"/>' for i, (x, y) in enumerate(arms))
+    rotors = "".join(
+        f'<motor site="r{i}" gear="0 0 1 0 0 {0.1 * (-1) ** i}"/>' for i in range(len(arms))
+    )
+    hover = " ".join([str(WEIGHT / len(arms))] * len(arms))
+    text = f"""<mujoco><worldbody><body pos="0 0 1"><freejoint/>
+      <geom type="box" size="0.1 0.1 0.02" mass="1"/><site name="grip"/>{sites}</body></worldbody>
+      <actuator>{rotors}</actuator>
+      <keyframe><key name="home" ctrl="{hover}"/></keyframe></mujoco>"""
+    with started(tmp_path, text) as bridge:
+        assert not bridge.scene.is_carried
+        summary = bridge.run(duration=0.5)
+    assert summary.stopped_by == "duration"
+    assert summary.peak_force < 1.5
+
+
 FLOPPY = """<mujoco>
   <worldbody>
     <body name="trunk" pos="0 0 1">

@@ -202,9 +202,9 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     yield Fault(
         "heavy tool",
         case.places.find("body", int(of_tool[0])),  # the first that moves
-        f"{what} weighs {weight(mass)}; where no contact, limit or dry friction carries it, the "
-        f"hand carries {' and '.join(parts)} at rest; a run carries it where the device cannot, "
-        "and with --no-tool-weight",
+        f"{what} weighs {weight(mass)}; where no contact, limit, equality, dry friction or "
+        f"motor carries it, the hand carries {' and '.join(parts)} at rest; a run carries it where "
+        "the device cannot, and with --no-tool-weight",
         f'gravcomp="1" in {where}, or less mass'
         + (", or a grip nearer to the centre of mass" if droop > MAX_DROOP else ""),
     )

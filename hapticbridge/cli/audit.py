@@ -366,7 +366,8 @@ def _print_report(report: AuditReport) -> None:
         out.print(f"  events: {plain(listed)}")
     rate = f", {certification.kept.remark}" if certification and certification.kept.remark else ""
     unfinished = "; the tick that tripped is not among them" if report.trip else ""
-    out.print(f"  {report.ticks} ticks, {report.duration:.3f} s{rate}{unfinished}")
+    time = f", {report.duration:.3f} s" if report.duration else ""  # unknown without metadata
+    out.print(f"  {report.ticks} ticks{time}{rate}{unfinished}")
     rows = energy_rows(report.energies, report.start_potential, report.credit)
     if energies := [" ".join(row) for row in rows]:
         out.print(f"  {', '.join(energies)}")

@@ -411,7 +411,8 @@ def read_bag(path: Path, topic: str = "") -> Motion:
 
     Raises:
         DeviceError: The file cannot be read, a checksum of it does not match, it has no such topic,
-            a message is not valid, or some stamps are 0 and others of another clock.
+            a message is not valid, the poses are in several frames, or some stamps are 0 and others
+            of another clock.
 
     Warns:
         UserWarning: Times look like those of another unit.
@@ -442,7 +443,7 @@ def read_bag(path: Path, topic: str = "") -> Motion:
             f"{choices(poses)}"
         )
     topic = topic or poses[0]
-    stamps, logged, numbers = [], [], []
+    stamps, logged, frames, numbers = [], [], [], []
     with path.open("rb") as file:
         try:
             has_chunks = (index := _index(file)) is not None and index.chunk_indexes
@@ -451,8 +452,9 @@ def read_bag(path: Path, topic: str = "") -> Motion:
             for _, channel, message in reader.iter_messages([topic], log_time_order=False):
                 if (encoding := channel.message_encoding) != _CDR:
                     raise ValueError(f"its encoding is {encoding!r:.40}, not '{_CDR}'")
-                stamp, pose = _pose_of(message.data)
+                stamp, frame, pose = _pose_of(message.data)
                 stamps.append(stamp)
+                frames.append(frame)
                 logged.append(message.log_time)
                 numbers.append(pose)
         except (OSError, McapError, struct.error, LookupError, *_DAMAGED) as error:
@@ -463,6 +465,11 @@ def read_bag(path: Path, topic: str = "") -> Motion:
     times = np.array(stamps if any(stamps) else logged, dtype=np.int64)
     if len(times) < 2:
         raise DeviceError(f"{path}: {topic} has {len(times)} of at least two messages")
+    if len(found := sorted(set(frames))) > 1:
+        raise DeviceError(
+            f"{path}: the poses of {topic} are in {len(found)} frames, {choices(found)}; write the "
+            "bag with those in one of them"
+        )
     unset = np.flatnonzero(times == 0)
     # a simulated clock begins at 0, and may stay there for some messages
     is_before = unset.size < len(times) and unset.size == np.argmax(times != 0)
@@ -544,8 +551,8 @@ _ALIGNED_TO = {0x0000: 8, 0x0001: 8, 0x0006: 4, 0x0007: 4}
 """Largest alignment in bytes by the representation of a message: plain CDR of versions 1 and 2."""
 
 
-def _pose_of(data: bytes) -> tuple[int, tuple[float, ...]]:
-    """Returns stamp in ns and numbers of a ``PoseStamped``: x, y, z in m, then qx, qy, qz, qw.
+def _pose_of(data: bytes) -> tuple[int, str, tuple[float, ...]]:
+    """Returns stamp in ns, frame and numbers of a ``PoseStamped``: x, y, z in m, qx, qy, qz, qw.
 
     It is CDR: two bytes of the representation, whose last bit says little-endian, two of options;
     then the stamp, the length of the frame's name and the name, and the numbers at a multiple of 8
@@ -565,4 +572,5 @@ def _pose_of(data: bytes) -> tuple[int, tuple[float, ...]]:
     order, size = "<" if representation & 1 else ">", _ALIGNED_TO[representation]
     seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
     start = 4 + (12 + length + size - 1) // size * size
-    return seconds * 10**9 + nanoseconds, struct.unpack_from(f"{order}7d", data, start)
+    frame = data[16 : 16 + length].rstrip(b"\0").decode(errors="replace")
+    return seconds * 10**9 + nanoseconds, frame, struct.unpack_from(f"{order}7d", data, start)

@@ -60,6 +60,8 @@ class Contents:
         refusal: Reason why the records cannot be read; None if they can.
         keeps_events: True to parse events, and to compare the messages for ROS 2.
         has_messages: True if there are such messages.
+        other_schemas: Topics of the messages for ROS 2 with another schema, as sentences. In a
+            recording this is damage, in a bag of another program it is not.
     """
 
     problems: list[str]
@@ -71,6 +73,7 @@ class Contents:
     refusal: str | None = None
     keeps_events: bool = True
     has_messages: bool = False
+    other_schemas: list[str] = field(default_factory=list)
     _written: ros_messages.Checksums = field(default_factory=ros_messages.Checksums)
     _derived: ros_messages.Checksums = field(default_factory=ros_messages.Checksums)
     _messages: ros_messages.Messages | None = None
@@ -162,7 +165,9 @@ class Contents:
             stored = name, schema_encoding, encoding, layout.without_comments(text)
             own = own_name, layout.TICK_SCHEMA_ENCODING, layout.TICK_ENCODING
             if stored != (*own, layout.without_comments(own_text)):
-                raise DamageError(f"its topic {topic} has another schema than '{own_name}'")
+                words = f"its topic {topic} has another schema than '{own_name}'"
+                self.other_schemas.append(words)
+                return
             self._topics[channel], self.has_messages = topic, True
         if topic in _HANDS and channel not in self._topics:
             if (name, schema_encoding) != (layout.TICK_SCHEMA_NAME, layout.TICK_SCHEMA_ENCODING):
@@ -526,6 +531,8 @@ def _read_through(
     *_, (container, contents) = _read_parts(path, take)
     if contents.meta is not None:  # before its fields, which another format explains
         layout.refuse_format(path, contents.meta)
+    if contents.has_ticks or contents.meta is not None:
+        contents.problems.extend(contents.other_schemas)
     if not contents.has_ticks:
         # a file cut inside its first chunk has no schema yet, but has metadata
         if contents.refusal or contents.meta is None or not container.is_cut:

@@ -286,7 +286,8 @@ def toppling_force(scene: Scene, parameters: RunParameters) -> float:
 
         K_t = −∂Q/∂q,    K_t φ = λ M φ,    rate = √−λ
 
-    has a rate above ``SLOWEST_TOPPLING``; Q are the generalised forces, M the inertia matrix. The
+    has a rate above ``SLOWEST_TOPPLING``; Q are the generalised forces, M the inertia matrix. K_t
+    is not symmetric where a motor's force turns with the tool, as the thrust of a rotor does. The
     handle then holds the grip at ``TIPPED`` along the fastest mode φ. Zero if it does not topple,
     or the mode does not move the grip, or a joint is held.
 
@@ -305,13 +306,14 @@ def toppling_force(scene: Scene, parameters: RunParameters) -> float:
     if is_held or np.linalg.norm(jacobian[:, dofs] @ data.qacc[dofs]) > RESTING:
         return 0.0
     mujoco.mj_fullM(model, data, mass)
-    root = np.linalg.inv(np.linalg.cholesky(mass[np.ix_(dofs, dofs)]))
-    stiffness = root @ stiffness_without_hand(model, data, dofs) @ root.T
-    squares, modes = np.linalg.eigh(0.5 * (stiffness + stiffness.T))
+    stiffness = stiffness_without_hand(model, data, dofs)
+    squares, modes = np.linalg.eig(np.linalg.solve(mass[np.ix_(dofs, dofs)], stiffness))
+    fastest = int(np.argmin(squares.real))
     mode = np.zeros(model.nv)
-    mode[dofs] = root.T @ modes[:, 0]
+    mode[dofs] = modes[:, fastest].real
     way = float(np.linalg.norm(jacobian @ mode))
-    if squares[0] > -(SLOWEST_TOPPLING**2) or way < MIN_LEVER * float(np.linalg.norm(mode)):
+    is_slow = squares[fastest].real > -(SLOWEST_TOPPLING**2)
+    if is_slow or way < MIN_LEVER * float(np.linalg.norm(mode)):
         return 0.0
     mujoco.mj_integratePos(model, data.qpos, mode, TIPPED / way)
     mujoco.mj_kinematics(model, data)

@@ -222,12 +222,11 @@ def constraint_name(model: mujoco.MjModel, data: mujoco.MjData, row: int) -> str
         return f"the friction of joint '{model.joint(joint).name or joint}'"
     if kind == int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON):
         return f"the friction of tendon '{model.tendon(number).name or number}'"
-    sides = [int(geom) for geom in data.contact[number].geom if geom >= 0]
+    sides = [model.geom(int(geom)) for geom in data.contact[number].geom if geom >= 0]
+    bodies = [int(geom.bodyid[0]) for geom in sides]
     names = [
-        f"geom '{model.geom(i).name}'"
-        if model.geom(i).name
-        else f"body '{model.body(int(model.geom_bodyid[i])).name}'"
-        for i in sides
+        f"geom '{geom.name}'" if geom.name else f"body '{model.body(body).name or body}'"
+        for geom, body in zip(sides, bodies, strict=True)
     ]
     return f"the contact of {' and '.join(names) or 'a flex'}"
 

@@ -472,7 +472,8 @@ def home(link: Link, stream: ReplyStream, name: str, notify: Notify) -> None:
         if not is_prompted:
             is_prompted = True
             notify(f"{name}: pull the grip all the way out and push it back in, slowly")
+    passed = int(stream.reply["homed"][0]).bit_count()
     raise DeviceError(
-        f"{name}: was not homed within {HOMING_TIME:g} s; open it again and move the "
-        "grip all the way out and in"
+        f"{name}: was not homed within {HOMING_TIME:g} s, in which {passed} of its 3 encoders "
+        "passed their zero; open it again and move the grip all the way out and in"
     )
