@@ -14,7 +14,7 @@ import h5py
 import mujoco
 import numpy as np
 import pytest
-from audit_cases import recorded
+from audit_cases import SlowClock, recorded
 from cli_cases import Called, one_sentence
 from PIL import Image
 
@@ -266,6 +266,22 @@ def test_frames_that_would_repeat_are_refused_with_the_most(
     state = np.array(lerobot(done.folder, 0)["observation.state"])
     assert (np.abs(np.diff(state[2:], axis=0)).max(axis=1) > 0.0).all()  # it starts at rest
     assert pq.read_table(done.folder / "meta" / "tasks.parquet").to_pandas().index[0] == ""
+
+
+def test_frames_that_repeat_because_deadlines_were_skipped_are_counted(
+    call: Called, tmp_path: Path
+) -> None:
+    """Ticks at 200 ms and 281 ms: of the frames at 201, 211 … 271, 281 ms seven repeat another."""
+    paths = tmp_path / "late.mcap", tmp_path / "whole.mcap"
+    for path, stalls in zip(paths, ({200: 80}, {}), strict=True):
+        recorded(path, "point_mass", duration=0.6, clock=SlowClock(stalls))
+    folder = tmp_path / "set"
+    code, _, err = call("export", *paths, "--format", "lerobot", "--fps", "100", "--out", folder)
+    assert code == 0
+    (told,) = [line for line in " ".join(err.split()).split("warning: ") if "repeat" in line]
+    assert "late.mcap: 7 of its frames repeat the one before" in told
+    state = np.array(lerobot(folder, 0)["observation.state"])
+    assert sum((state[1:] == state[:-1]).all(axis=1)) == 7
 
 
 def test_a_programs_run_has_its_tool_and_says_where_it_was_placed_anew(

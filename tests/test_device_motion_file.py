@@ -25,7 +25,9 @@ import hapticbridge as hb
 from hapticbridge.check.case import motion_for
 from hapticbridge.device import open_device, read_motion
 from hapticbridge.device.motion_file import read_bag
+from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import DeviceError, RecordingError
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.scene import load_scene
 from hapticbridge.tools.export import export
 
@@ -152,7 +154,8 @@ def test_a_clock_that_was_set_in_a_motion_is_told(tmp_path: Path) -> None:
     with pytest.raises(DeviceError, match="jumps by 11574 days after 13 of 30 poses"):
         read_motion(tmp_path / "hand.csv")
     (tmp_path / "hand.csv").write_text("t,x,y,z\n" + rows.replace("1000000000.", "80000."))
-    assert read_motion(tmp_path / "hand.csv").duration == pytest.approx(80000.29)  # a long pause
+    with pytest.warns(UserWarning, match="no pose from 0.12 to 80000.13 s"):  # a long pause
+        assert read_motion(tmp_path / "hand.csv").duration == pytest.approx(80000.29)
 
 
 def test_of_several_topics_one_is_named(tmp_path: Path) -> None:
@@ -461,6 +464,27 @@ def test_a_slow_walk_and_a_few_rows_are_no_mistake(tmp_path: Path) -> None:
     assert read_motion(tmp_path / "hand.csv").duration == pytest.approx(0.29)
 
 
+@pytest.mark.parametrize("is_bag", [False, True])
+def test_a_gap_between_poses_is_told(tmp_path: Path, *, is_bag: bool) -> None:
+    """Poses every 10 ms, of which a recorder lost those of 0.5 s, and once those of 0.25 s too."""
+
+    def read(kept: list[int]) -> Motion:
+        if is_bag:
+            folder = bag(tmp_path / f"{len(kept)}", {"/hand": [ramp(200)[i] for i in kept]})
+            return read_bag(next(folder.glob("*.mcap")))
+        rows = "".join(f"{0.01 * i:.2f},{1e-3 * i},0,0\n" for i in kept)
+        (tmp_path / "hand.csv").write_text("t,x,y,z\n" + rows)
+        return read_motion(tmp_path / "hand.csv")
+
+    once = [i for i in range(200) if not 50 < i < 100]
+    twice = [i for i in once if not 120 < i < 145]
+    with pytest.warns(UserWarning, match=r"no pose from 0\.50 to 1\.00 s, where poses are 0\.01 s"):
+        assert read(once).duration == pytest.approx(1.99)
+    with pytest.warns(UserWarning, match=r"no pose from 0\.50 to 1\.00 s \(the longest of 2 gaps"):
+        read(twice)
+    read(list(range(0, 200, 2)))
+
+
 @pytest.mark.parametrize("text", ["0_1", "٠.٠١"])
 def test_numbers_in_another_notation_are_refused_at_their_line(tmp_path: Path, text: str) -> None:
     path = tmp_path / "motion.csv"
@@ -522,6 +546,18 @@ def test_a_damaged_recording_is_no_motion_and_a_cut_one_says_so(tmp_path: Path) 
     for read in (lambda: open_device(f"trajectory:{run}"), lambda: motion_for(scene, run)):
         with pytest.warns(UserWarning, match="its end is missing.*; the motion ends there"):
             read()
+
+
+def test_time_that_a_recorded_run_skipped_is_told(tmp_path: Path) -> None:
+    rows = np.zeros(1000, TICK_DTYPE)
+    rows["tick"], rows["device_quaternion"] = np.arange(1000), (1.0, 0.0, 0.0, 0.0)
+    rows["deadline_ns"] = 10**6 * (rows["tick"] + 1 + np.where(rows["tick"] < 400, 0, 300))
+    write_recording(tmp_path / "paused.mcap", rows)
+    open_device(f"trajectory:{tmp_path / 'paused.mcap'}")  # between two runs
+    rows["flags"][400] = hb.TickFlag.OVERRUN
+    write_recording(tmp_path / "late.mcap", rows)
+    with pytest.warns(UserWarning, match=r"skipped deadlines, 0\.3 s in all; .*that much shorter"):
+        open_device(f"trajectory:{tmp_path / 'late.mcap'}")
 
 
 @pytest.mark.parametrize("ending", [".db3", ".bag", ".zstd", ".gz"])

@@ -232,7 +232,13 @@ class Export:
             episodes = format_count(len(done.episodes), "episode")
             out.print(f"wrote {plain(str(done.folder))}: {episodes}, {frames}")
         _tell_odd(done.odd)
-        for file, resets, end in zip(self.files, done.resets, done.ends, strict=True):
+        each = zip(self.files, done.resets, done.ends, done.repeats, strict=True)
+        for file, resets, end, repeats in each:
+            if repeats:
+                err.print(
+                    f"[yellow]warning:[/yellow] {plain(str(file))}: {repeats} of its frames repeat "
+                    "the one before, because the run skipped deadlines there"
+                )
             if end:
                 told = plain(f"{file}: {end}; look at its episode")
                 err.print(f"[yellow]warning:[/yellow] {told}")

@@ -670,6 +670,8 @@ class Run:
             )
         elif moved is not None and moved.deviations:
             notify("; ".join(filter(None, (str(moved), moved.advice(setting)))))
+        elif moved is not None and moved.lost:
+            notify(moved.doubt)
         return count
 
     def _scene_ticks(self, scene: Scene) -> int:

@@ -358,7 +358,11 @@ class Timekeeping:
             return ""
         if self.is_realtime or _is_own(self.in_time):
             return f"deadlines were missed: try {self.remedy}" if self.share < MANY_KEPT else ""
-        return "deadlines were missed: --realtime requests the processor for the loop"
+        return (
+            "deadlines were missed, and after each the handle follows the hand in part "
+            "('hapticbridge guide missed-deadlines'): --realtime requests the processor for "
+            "the loop"
+        )
 
     @property
     def fault(self) -> str:

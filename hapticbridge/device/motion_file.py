@@ -29,6 +29,7 @@ from hapticbridge.device.trajectory import (
 )
 from hapticbridge.errors import DeviceError, RecordingError, choices
 from hapticbridge.files import foreign_kind
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.units import format_number
 
 # Any of them
@@ -301,6 +302,10 @@ _SMALLER = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
 MANY_ROWS = 20
 """Number of rows from which on their times are judged. Fewer may be single poses, s apart."""
 
+LONG_GAP, LONG_SHARE = 0.1, 20.0
+"""Time in s between two rows, and number of median ones, above which rows are taken for lost. A
+tracker that misses a few poses has no gap."""
+
 
 def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
     """Returns a motion whose times are in s and lengths in m, as far as a hand's motion tells.
@@ -347,7 +352,30 @@ def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
             f"{path}: the time jumps by {days:.0f} days after {before} of {len(table)} poses, as "
             "where a clock is set; write the motion without those on one side"
         )
+    if len(table) >= MANY_ROWS:
+        _tell_gaps(table[:, 0], path)
     return Motion(table[:, 0], table[:, 1:4], table[:, 4:])
+
+
+def _tell_gaps(times: NDArray[np.float64], path: Path) -> None:
+    """Warns of the longest time without rows, as where a recorder lost messages.
+
+    Warns:
+        UserWarning: There is one. The hand may have rested, which the rows do not tell.
+    """
+    steps = np.diff(times)
+    usual = float(np.median(steps))
+    gaps = np.flatnonzero(steps > max(LONG_GAP, LONG_SHARE * usual))
+    if not gaps.size:
+        return
+    longest = gaps[steps[gaps].argmax()]
+    begin, end = times[longest : longest + 2] - times[0]
+    also = f" (the longest of {gaps.size} gaps)" if gaps.size > 1 else ""
+    warnings.warn(
+        f"{path}: no pose from {begin:.2f} to {end:.2f} s{also}, where poses are "
+        f"{format_number(usual, 3)} s apart; the motion goes straight from one to the next",
+        stacklevel=4,
+    )
 
 
 # Recording
@@ -361,7 +389,7 @@ def read_recorded(path: Path) -> tuple[NDArray[np.void], float]:
         RecordingError: It cannot be read, or is of several hands.
 
     Warns:
-        UserWarning: Its end is missing.
+        UserWarning: Its end is missing, or deadlines were skipped between two of its ticks.
     """
     # imported here, because no other device needs it
     from hapticbridge.recording import read_recording  # noqa: PLC0415
@@ -375,7 +403,16 @@ def read_recorded(path: Path) -> tuple[NDArray[np.void], float]:
         )
     if recording.cut_sentence:
         warnings.warn(f"{path}: {recording.cut_sentence}; the motion ends there", stacklevel=2)
-    return recording.ticks, period
+    ticks = recording.ticks
+    is_after = (ticks["flags"][1:] & TickFlag.OVERRUN) != 0
+    lost = np.diff(ticks["deadline_ns"])[is_after] * 1e-9 - period
+    if (missing := float(lost.sum())) > LONG_GAP:
+        warnings.warn(
+            f"{path}: its run skipped deadlines, {format_number(missing, 3)} s in all; the motion "
+            "is replayed tick by tick, and is that much shorter",
+            stacklevel=2,
+        )
+    return ticks, period
 
 
 # Bag of ROS 2

@@ -65,6 +65,10 @@ NOTABLE_ENERGY = 1e-4
 """Energy in J that a scene may create with a remedy: a tenth of what a hand puts in when it
 taps."""
 
+NOTABLE_LOSS = 1e-3
+"""Energy in J by which a scene may have less than under the file's own options: what a hand puts in
+when it taps."""
+
 PART = 0.25
 """Part of a deviation, no unit, from which on a replacement that makes it is a cause among others.
 Smaller parts are found by chance where contacts open and close."""
@@ -151,6 +155,8 @@ class Fidelity:
             both places of its body; empty if none does.
         remedy: Rate, substeps and contact with which no body deviates, tried; None without one.
         more: Force in N by which a still hand bears more with the remedy than without; at least 0.
+        lost: Energy in J that the scene has less at the end than in both motions of the file, where
+            these agree on it; else 0.
     """
 
     deviations: tuple[Deviation, ...]
@@ -163,6 +169,7 @@ class Fidelity:
     constraint: str = ""
     remedy: RunPoint | None = None
     more: float = 0.0
+    lost: float = 0.0
 
     @property
     def size(self) -> float:
@@ -201,11 +208,16 @@ class Fidelity:
         more = (
             f" and of {len(others)} more bod{'ies' if len(others) > 1 else 'y'}" if others else ""
         )
+        then = format_si(self.lost, "J")
+        less = (
+            f"; but the scene then has {then} less than with either: fast swings and "
+            "contacts lose more in a run"
+        )
         return (
             f"without a hand, the place of '{first}'{more} after {self.seconds:.2g} s depends on "
             f"the file's time step of {format_si(self.step, 's')}: with half of it, it is about as "
             "far away as in a run"
-        )
+        ) + (less if self.lost else "")
 
     def advice(self, setting: RunPoint) -> str:
         """Returns options of a run that mend a deviation, and what they gave; empty without."""
@@ -382,7 +394,8 @@ class _FileMotion:
         sizes = np.where(self._are_free(), _size(apart), 0.0)
         if sizes.max(initial=0.0) <= 1.0:
             return found
-        moved, spread = self.start.apart(self.end)[0], self._spread()
+        moved, (spread, energies) = self.start.apart(self.end)[0], self._other_motion()
+        lost = min(energies) - self._energy(scene.data)
         allowed = np.where(spread < CHAOS, SPREAD * spread, math.inf)
         names = [str(self.model.body(i).name) or str(i) for i in range(self.model.nbody)]
         worst = [int(i) for i in np.argsort(-sizes) if sizes[i] > 1.0]
@@ -394,6 +407,7 @@ class _FileMotion:
                 if sizes[i] > allowed[i]
             ),
             incomparable=tuple(names[i] for i in worst if sizes[i] <= allowed[i]),
+            lost=lost if lost > max(NOTABLE_LOSS, SPREAD * abs(np.diff(energies)[0])) else 0.0,
         )
 
     @property
@@ -409,16 +423,30 @@ class _FileMotion:
             free[body] |= free[model.body_parentid[body]]
         return free
 
-    def _spread(self) -> NDArray[np.float64]:
-        """Returns the size of the difference to a second motion of the file, (nbody,)."""
+    def _other_motion(self) -> tuple[NDArray[np.float64], tuple[float, float]]:
+        """Returns the size of the difference to a second motion of the file, (nbody,).
+
+        The energies in J are those at the end of both motions.
+        """
         model = copy.copy(self.model)
         model.opt.timestep /= 2.0
         rng = np.random.default_rng(0)
         step = rng.uniform(-DISTURBANCE, DISTURBANCE, model.nv)
         other = _moved(model, self.data, 2 * self.count, step)
         if other is None:
-            return np.full(model.nbody, math.inf)
-        return _size(_places(other).apart(self.end))
+            return np.full(model.nbody, math.inf), (-math.inf, math.inf)
+        energies = self._energy(self.last), self._energy(other)
+        return _size(_places(other).apart(self.end)), energies
+
+    def _energy(self, moved: mujoco.MjData) -> float:
+        """Returns the kinetic and potential energy in J of the file's scene in another's state."""
+        model, data = self.model, copy.copy(self.data)
+        data.qpos[:], data.qvel[:] = moved.qpos, moved.qvel
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_energyPos(model, data)
+        mujoco.mj_energyVel(model, data)
+        return float(data.energy.sum())
 
     def _settings(
         self, scene: Scene, setting: RunPoint

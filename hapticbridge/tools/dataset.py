@@ -74,6 +74,7 @@ class Episode:
         states: ``qpos`` and ``qvel`` in a row, (n, nq + nv).
         pictures: PNG of each frame; none without a camera.
         odd: Names of those readings of sensors that the file alone would not give, by the reason.
+        repeats: Number of frames that repeat the one before, because deadlines were skipped.
     """
 
     name: str
@@ -83,6 +84,7 @@ class Episode:
     states: NDArray[np.float64]
     pictures: tuple[bytes, ...] = field(repr=False)
     odd: Mapping[str, list[str]] = field(default_factory=dict)
+    repeats: int = 0
 
     def __len__(self) -> int:
         return len(self.states)
@@ -152,6 +154,7 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
         states=np.concatenate([found["qpos"], found["qvel"]], axis=1)[:-1],
         pictures=tuple(found["pictures"][:count]),
         odd=found["odd_readings"],
+        repeats=int(np.sum(np.diff(rows["tick"][:-1]) == 0)),
     )
 
 
@@ -463,6 +466,7 @@ class WrittenDataset:
         episodes: Number of frames of each episode.
         resets: Times in s within each episode at which the scene was reset, so that it jumps.
         ends: What ended each episode's run, as a clause; empty for an ordinary end.
+        repeats: Number of frames of each episode that repeat the one before.
         odd: Names of those readings of sensors that the file alone would not give, by the reason.
     """
 
@@ -470,6 +474,7 @@ class WrittenDataset:
     episodes: tuple[int, ...]
     resets: tuple[tuple[float, ...], ...]
     ends: tuple[str, ...]
+    repeats: tuple[int, ...]
     odd: dict[str, list[str]]
 
 
@@ -520,7 +525,7 @@ def write_dataset(
             f"the recordings are of the scenes {choices(scenes)}, and one's name is no task for "
             "all; say with --task what was done"
         )
-    draft, counts, odd = draft_of(folder), [], dict[str, list[str]]()
+    draft, counts, repeats, odd = draft_of(folder), [], [], dict[str, list[str]]()
     try:
         shutil.rmtree(draft, ignore_errors=True)
         draft.mkdir()
@@ -529,6 +534,7 @@ def write_dataset(
             for episode in _episodes(recordings, shot, progress):
                 writer.add(episode)
                 counts.append(len(episode))
+                repeats.append(episode.repeats)
                 for why, names in episode.odd.items():
                     odd[why] = list(dict.fromkeys([*odd.get(why, []), *names]))
             writer.finish()
@@ -539,7 +545,7 @@ def write_dataset(
         shutil.rmtree(draft, ignore_errors=True)
     ends = (unusual_end(Trip.among(each.events), each.events) for each in recordings)
     resets = tuple(map(_resets, recordings))
-    return WrittenDataset(folder, tuple(counts), resets, tuple(ends), odd)
+    return WrittenDataset(folder, tuple(counts), resets, tuple(ends), tuple(repeats), odd)
 
 
 def _placings(recording: RecordingFile) -> list[Mapping[str, Any]]:
