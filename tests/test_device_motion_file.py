@@ -170,6 +170,13 @@ def test_of_several_topics_one_is_named(tmp_path: Path) -> None:
         open_device(f"trajectory:{file}:/foot")
 
 
+def test_the_only_topic_with_messages_is_the_motion(tmp_path: Path) -> None:
+    (file,) = bag(tmp_path / "one", {"/a": [], "/hand": ramp(9), "/z": []}).glob("*.mcap")
+    assert open_device(f"trajectory:{file}").info.duration == pytest.approx(0.08, abs=1e-12)
+    with pytest.raises(DeviceError, match="/a has 0 of at least two messages"):
+        open_device(f"trajectory:{file}:/a")
+
+
 def test_a_bag_that_is_no_motion_is_refused_with_what_it_holds(tmp_path: Path) -> None:
     twist = [
         (time, pose_message(time, 0.0, "geometry_msgs/msg/TwistStamped")) for time, _ in ramp()

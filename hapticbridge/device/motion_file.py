@@ -444,7 +444,7 @@ def read_bag(path: Path, topic: str = "") -> Motion:
 
     Args:
         path: The file.
-        topic: The topic; it may be empty if there is only one of ``PoseStamped``.
+        topic: The topic; it may be empty if there is only one of ``PoseStamped`` with messages.
 
     Raises:
         DeviceError: The file cannot be read, a checksum of it does not match, it has no such topic,
@@ -474,31 +474,32 @@ def read_bag(path: Path, topic: str = "") -> Motion:
     if not poses:
         listed = choices(f"{name} ({kind})" for name, kind in kinds.items())
         raise DeviceError(f"{path}: has no topic of {POSE}; topics: {listed}")
-    if not topic and len(poses) > 1:
-        raise DeviceError(
-            f"{path}: has several topics of {POSE}; name one, 'trajectory:{path}:{poses[0]}': "
-            f"{choices(poses)}"
-        )
-    topic = topic or poses[0]
-    stamps, logged, frames, numbers = [], [], [], []
+    rows: dict[str, list[tuple[int, int, str, tuple[float, ...]]]]
+    rows = {name: [] for name in ([topic] if topic else poses)}
+    topic = topic or poses[0]  # until a message is of another
     with path.open("rb") as file:
         try:
             has_chunks = (index := _index(file)) is not None and index.chunk_indexes
             make = make_reader if has_chunks else NonSeekingReader
             reader = make(file, validate_crcs=True)
-            for _, channel, message in reader.iter_messages([topic], log_time_order=False):
+            for _, channel, message in reader.iter_messages(rows, log_time_order=False):
+                topic = channel.topic
                 if (encoding := channel.message_encoding) != _CDR:
                     raise ValueError(f"its encoding is {encoding!r:.40}, not '{_CDR}'")
                 stamp, frame, pose = _pose_of(message.data)
-                stamps.append(stamp)
-                frames.append(frame)
-                logged.append(message.log_time)
-                numbers.append(pose)
+                rows[topic].append((stamp, message.log_time, frame, pose))
         except (OSError, McapError, struct.error, LookupError, *_DAMAGED) as error:
             reason = str(error) or type(error).__name__
             raise DeviceError(
-                f"{path}: message {len(stamps)} of {topic} cannot be read ({reason})"
+                f"{path}: message {len(rows[topic])} of {topic} cannot be read ({reason})"
             ) from None
+    if len(filled := [name for name, own in rows.items() if own]) > 1:
+        raise DeviceError(
+            f"{path}: has several topics of {POSE}; name one, 'trajectory:{path}:{filled[0]}': "
+            f"{choices(filled)}"
+        )
+    topic = filled[0] if filled else topic
+    stamps, logged, frames, numbers = zip(*rows[topic], strict=True) if filled else ((),) * 4
     times = np.array(stamps if any(stamps) else logged, dtype=np.int64)
     if len(times) < 2:
         raise DeviceError(f"{path}: {topic} has {len(times)} of at least two messages")
