@@ -182,6 +182,13 @@ class RunOutcome:
         return self.probed.added_delay(info, period) if self.probed else 0.0
 
 
+_UNJUDGED = {
+    "empty": "the run ended before its first tick, so there is nothing to judge",
+    "unverified": "MuJoCo could not simulate the scene to the end",
+}
+"""Reasons of a verdict that is neither ``passive`` nor ``active``."""
+
+
 def posted_words(credit: float) -> str:
     """Returns what is known of a run in which another program steps the scene."""
     return (
@@ -351,7 +358,7 @@ class Summary:
             what = "the hand got energy for which nothing paid"
             return f"active: {'the simulation made energy' if port == 'environment' else what}"
         if self.verdict != "passive":
-            return f"{self.verdict}: MuJoCo could not simulate the scene to the end"
+            return f"{self.verdict}: {_UNJUDGED[self.verdict]}"
         if self.certification.standing is Standing.NO_HAND:
             return "passive: the scene gave out no more energy than it got"
         if self.is_certified:
@@ -401,6 +408,8 @@ class Summary:
         yield from self._last_lines()
 
     def _verdict_lines(self) -> Iterator[str]:
+        if self.verdict == "empty":
+            return
         tick, port = self.fault or (0, "")
         used = f"at its worst tick {format_share(self.slack_share)} of the slack used"
         used = f", {used}" if self.slack_share else ""
@@ -510,8 +519,11 @@ class Summary:
     def verdict(self) -> str:
         """``passive`` (strict or within slack, without a metered kick), or ``active``.
 
-        It is ``unverified`` if MuJoCo dropped contacts or its numbers were bad.
+        It is ``unverified`` if MuJoCo dropped contacts or its numbers were bad, and ``empty`` if
+        the run held no tick.
         """
+        if not self.ticks:
+            return "empty"
         if self.fault is not None:
             return "active"
         return "unverified" if self.trip and self.trip.is_unsound else "passive"
