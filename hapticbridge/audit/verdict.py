@@ -48,7 +48,12 @@ from hapticbridge.kernel.record import CLOCK_FIELDS
 from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.format import SHOWN_EVENT
 from hapticbridge.recording.reader import open_hands
-from hapticbridge.run.description import meta_start, requested_of
+from hapticbridge.run.description import (
+    CHANGED_EVENT,
+    changed_words,
+    meta_start,
+    requested_of,
+)
 from hapticbridge.run.summary import Environment, posted_words, was_never_lossless
 from hapticbridge.units import facts_html, format_energy
 
@@ -392,9 +397,7 @@ def decide(
         gap: Clause with the reason why the run was not simulated again; empty if it was.
         strict: True accepts only (14) itself, not the slack that the device condition leaves.
     """
-    if fault is None and energies is None:
-        return replace(report, verdict="empty", sentence=NOTHING_TO_JUDGE)
-    if fault is not None or energies is None:
+    if fault is not None:
         return replace(
             report,
             sentence=fault.reason,
@@ -402,6 +405,8 @@ def decide(
             port=fault.port,
             joules=fault.joules,
         )
+    if energies is None:
+        return replace(report, verdict="empty", sentence=NOTHING_TO_JUDGE)
     unstrict, active, excess = energies.unstrict, energies.active, energies.excess
     state: Environment = "strict" if unstrict is None else "within slack"
     report = replace(report, environment=state, slack_share=energies.slack_share)
@@ -509,7 +514,7 @@ def verdict_on(
                 if fault is None:
                     outcome = replayed()
                     report = replace(report, agreement=outcome.agreement, obstacle=outcome.obstacle)
-                    fault = _replay_fault(outcome)
+                    fault = _replay_fault(outcome, recording.events)
     except RecordingError as error:  # what is damaged may lack metadata
         if recording.count or recording.problems or not recording.is_cut:
             fault = file_fault(recording) if recording.problems else Fault(str(error))
@@ -787,16 +792,17 @@ def _block_fault(block: AuditedBlock, balance: EnergyBalance, events: RunEvents)
     return min(faults, key=lambda fault: fault.tick or 0, default=None)
 
 
-def _replay_fault(outcome: ReplayOutcome) -> Fault | None:
+def _replay_fault(outcome: ReplayOutcome, events: Sequence[Mapping[str, Any]]) -> Fault | None:
     if not outcome.disagrees:
         return None
     if outcome.warning:
         reason = f"simulated again, tick {outcome.tick} is refused: {outcome.warning}"
         return Fault(reason, outcome.tick, outcome.field)
+    changed = next((e.get("fields") for e in events if e.get("event") == CHANGED_EVENT), None)
+    cause = changed_words(str(changed)[:MAX_WORDS] if changed else "")
     return Fault(
         f"simulated again, tick {outcome.tick} differs in {outcome.field} by "
-        f"{outcome.difference:.3g}: the recording was changed, or the scene was changed during "
-        "the run other than by set_input",
+        f"{outcome.difference:.3g}: {'' if changed else 'the recording was changed, or '}{cause}",
         outcome.tick,
         outcome.field,
     )

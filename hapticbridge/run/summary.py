@@ -162,6 +162,7 @@ class RunOutcome:
         probed: Result of the probe of the hand's device; None without one.
         own_loop: Account of a loop of the device's own; None without one.
         overlap: Pairs of the scene that began inside each other and still are; empty without any.
+        changed: Clause on fields of the model that a program changed meanwhile; empty without any.
     """
 
     ticks: int
@@ -176,6 +177,7 @@ class RunOutcome:
     probed: Probed | None = None
     own_loop: OwnLoopAccount | None = None
     overlap: str = ""
+    changed: str = ""
 
     def added_delay(self, info: DeviceInfo, period: float) -> float:
         """Returns the delay in s that the probe found beyond the stated one."""
@@ -269,6 +271,7 @@ class Summary:
         trip: Stop by the guard; None without one.
         probe: Result of the probe of the device before the run, as a clause; empty without one.
         overlap: Pairs of the scene that began inside each other and still are; empty without any.
+        changed: Clause on fields of the model that a program changed meanwhile; empty without any.
         hands: Summary of each hand by itself, if several hold the scene. Fault, share of the slack
             and certification of the whole are then those of all of them.
     """
@@ -305,6 +308,7 @@ class Summary:
     trip: Trip | None = None
     probe: str = ""
     overlap: str = ""
+    changed: str = ""
     hands: tuple[Summary, ...] = ()
 
     def at_record(self, record: np.void) -> Summary:
@@ -443,6 +447,8 @@ class Summary:
         skipped = f" ({self.skipped} deadlines skipped)" if self.skipped else ""
         if self.overlap:
             yield "overlap", f"{self.overlap} still; the scene began so"
+        if self.changed:
+            yield "scene", f"{self.changed}: no recording can repeat that"
         yield "overruns", f"{self.overruns}{skipped}, records dropped {self.dropped}"
         if self.probe:
             yield "probe", self.probe
@@ -599,6 +605,7 @@ class Summary:
             trip=outcome.trip,
             probe=outcome.probed.words if outcome.probed else "",
             overlap=outcome.overlap,
+            changed=outcome.changed,
             grip=parameters.grip,
             device=info.name,
             pulses=(
