@@ -13,6 +13,7 @@ import pytest
 from audit_cases import ScriptedDevice, recorded, rewritten
 from cli_cases import Called, one_sentence
 
+import hapticbridge as hb
 from hapticbridge.audit import audit
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.report.evidence import Evidence
@@ -195,11 +196,30 @@ def test_a_file_cut_before_its_first_tick_does_not_speak_of_the_run(
     early.write_bytes(cut_file.read_bytes()[:5000])
     code, out, _ = call("audit", early)
     assert code == 1
-    assert "the recording is empty: it holds no tick" in out
+    assert "empty\n  the recording holds no tick, so there is nothing to judge\n" in out
     assert "the file is cut: its end is missing" in out
     code, _, err = call("render", early, tmp_path / "early.png")
     assert code == 2
     assert "it holds no tick" in err
+
+
+def test_a_run_that_ended_before_its_first_tick_is_nothing_to_judge(
+    call: Called, tmp_path: Path
+) -> None:
+    path, page = tmp_path / "none.mcap", tmp_path / "none.html"
+    with hb.Bridge(
+        "virtual_wall", "simulated", clock=hb.SimulatedClock(), recording=path
+    ) as bridge:
+        bridge.stop()
+        assert bridge.run(0.1).verdict == "empty"
+    code, out, _ = call("audit", path, "--report", page)
+    nothing = "the recording holds no tick, so there is nothing to judge"
+    assert code == 1
+    assert f"empty\n  {nothing}; the run was stopped before its first tick\n" in out
+    assert f"{nothing[1:]}.</p>" in page.read_text(encoding="utf-8")
+    [report] = json.loads(call("audit", path, "--json")[1])
+    assert (report["verdict"], report["environment"]) == ("empty", None)
+    assert "1 empty" in call("audit", path, "--table", tmp_path / "a.csv")[1]
 
 
 def test_cut_file_is_called_cut_and_repaired(call: Called, cut_file: Path, tmp_path: Path) -> None:

@@ -428,7 +428,8 @@ def test_a_force_that_is_not_finite_is_not_sent(name: str, value: float, tmp_pat
 
 INFO = SimulatedDevice().info
 
-unknown_or_positive = st.none() | st.floats(1e-300, 1e300)
+positive = st.floats(1e-300, 1e300)
+unknown_or_positive = st.none() | positive
 at_least_zero = st.floats(0.0, 1e300)
 
 
@@ -445,8 +446,10 @@ some_axes = st.sets(st.sampled_from(AXES), min_size=1)
         is_real=st.booleans(),
         **dict.fromkeys(("mass", "rotational_inertia", "rate"), unknown_or_positive),
         **dict.fromkeys(("damping", "rotational_damping", "friction"), unknown_or_not_negative),
-        **dict.fromkeys(("resolution", "delay", "duration"), unknown_or_not_negative),
-        **dict.fromkeys(("force_limit", "torque_limit", "speed_limit"), at_least_zero),
+        **dict.fromkeys(("resolution", "duration"), unknown_or_not_negative),
+        **dict.fromkeys(("force_limit", "torque_limit"), positive),
+        delay=st.none() | st.floats(0.0, 1.0),
+        speed_limit=at_least_zero,
     )
 )
 def test_any_data_sheet_survives_json(info: DeviceInfo) -> None:
@@ -472,7 +475,15 @@ def test_any_data_sheet_survives_json(info: DeviceInfo) -> None:
             "must be of y, z, rx, ry, rz, each once, in this order",
         ),
         ({"axes": ("x",), "sensed": "rx"}, "sensed is 'rx'"),
-        ({"delay": -1e-3}, "delay is -0.001 s; it must be finite and >= 0"),
+        ({"delay": -1e-3}, "delay is -0.001 s; it must be 0 to 1"),
+        ({"delay": 2}, "delay is 2 s; it must be 0 to 1"),
+        ({"force_limit": 0}, "force_limit is 0; it must be > 0: it limits the force on the tool"),
+        (
+            {"force_limit": 0.0, "axes": ("rx",)},
+            "a device without any motor states is_prescribed=True",
+        ),
+        ({"torque_limit": 0, "axes": ("x",)}, "torque_limit is 0; it must be > 0: it limits the"),
+        ({"force_limit": -1.0}, "force limit is -1.0 N; it must be finite and > 0"),
         ({"mass": 0.0}, "mass is 0.0 kg; it must be finite and > 0"),
         ({"damping": -0.1}, "damping is -0.1 N s/m; it must be finite and >= 0"),
         ({"damping": "2"}, "damping is '2'"),

@@ -101,6 +101,17 @@ def test_a_limit_that_nobody_knows_must_be_named() -> None:
     assert turning <= {104, 105, 108, 109}
 
 
+def test_a_device_that_waits_for_its_calibration_is_refused_with_what_to_do() -> None:
+    stub = Stub(SIGMA7)
+    stub.call("uncalibrate", 1)
+    words = r"sigma\.7 is not calibrated since its power-on: put its end effector to the rest"
+    with pytest.raises(DeviceError, match=words):
+        stub.opened()
+    assert (stub.call("closed"), stub.call("enabled")) == (1, 0)
+    stub.call("uncalibrate", 0)
+    assert stub.opened().info.name == "sigma.7"
+
+
 def test_what_was_set_is_said_and_gravity_is_the_users_choice() -> None:
     said: list[str] = []
     stub = Stub()

@@ -122,6 +122,45 @@ def test_a_versegrip_that_is_gone_ends_the_run() -> None:
         ticks(device, bench.time, 5, FORCE)
 
 
+@pytest.mark.parametrize("asleep", [None, grip(0.0, 0.0, 0.0, 0.0)])
+def test_a_versegrip_that_is_listed_and_sends_nothing_ends_the_run(asleep: object) -> None:
+    bench = HaplyBench()
+    bench.service.orientation = grip(0.6, 0.8, 0.0, 0.0)
+    device = bench.opened()
+    device.start(PERIOD)
+    ticks(device, bench.time, 2000, np.zeros(6))  # at rest on the table it repeats itself
+    bench.time.advance(bench.time.now + 10.0)  # a pause of the loop is none of the grip
+    bench.service.orientation = asleep
+    ticks(device, bench.time, 490, np.zeros(6))
+    words = r"the VerseGrip is listed, but has sent no new orientation for 0\.5 s; wake it"
+    with pytest.raises(DeviceLost, match=words):
+        ticks(device, bench.time, 20, np.zeros(6))
+
+
+@pytest.mark.parametrize(
+    ("force", "is_turning", "is_lost"),
+    [(0.4, False, True), (0.4, True, False), (0.0, False, False)],
+)
+def test_a_versegrip_that_is_carried_and_repeats_its_orientation_ends_the_run(
+    force: float, is_turning: bool, is_lost: bool
+) -> None:
+    bench = HaplyBench(SimulatedDevice(hand=None, damping=2.0))
+    bench.service.orientation = grip(0.6, 0.8, 0.0, 0.0)
+    device = bench.opened()
+    device.start(PERIOD)
+    begin, wrench, says = bench.time.now, np.array([force, 0, 0, 0, 0, 0]), ""
+    try:
+        for k in range(800):  # v = F/b soon: 3 cm in 0.2 s
+            step = 2.0**-14 * (k // 400 % 2) if is_turning else 0.0
+            bench.service.orientation = grip(0.6, 0.8, step, 0.0)
+            ticks(device, bench.time, 1, wrench)
+    except DeviceLost as lost:
+        says = str(lost)
+    assert ("no new orientation for 0.5 s" in says) == is_lost
+    if is_lost:
+        assert bench.time.now - begin == pytest.approx(0.5, abs=0.01)
+
+
 def test_a_versegrip_that_sleeps_at_the_start_is_told() -> None:
     bench = HaplyBench()
     device = bench.opened()

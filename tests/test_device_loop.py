@@ -270,6 +270,14 @@ def test_a_python_without_the_loop_gets_advice(tmp_path: Path) -> None:
     assert "HAPTICBRIDGE_PYTHON" not in str(its_own.value)
 
 
+def test_a_loop_that_was_left_leaves_no_thread() -> None:
+    before = set(threading.enumerate())
+    for _ in range(2):
+        with DeviceLoop(is_simulated=True) as device:
+            followed(device, 0.04)
+    assert set(threading.enumerate()) == before
+
+
 def test_a_loop_that_dies_is_lost_and_not_waited_for() -> None:
     with DeviceLoop("simulated", is_simulated=True) as device:
         device.show(START)

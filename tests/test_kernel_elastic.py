@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from audit_cases import recorded
+from check_scenes import faults_of
 from kernel_runs import Array, at_rest, bind, live, load, mjcf
 
 import hapticbridge as hb
@@ -16,6 +19,7 @@ from hapticbridge.recording import read_recording
 from hapticbridge.report.cause import likely_cause
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.run.commands import Reset
+from hapticbridge.scene.physics import gradientless_flexes, storing_flex, unstored_words
 
 TOOL = """<body name="tool" pos="0 0 -1"><freejoint/><geom size=".015" mass=".1"/>
   <site name="grip"/></body>"""
@@ -122,6 +126,34 @@ def test_a_flex_that_yields_creates_no_energy(substeps: int, spread: float) -> N
     run = live(scene, at_rest(20), substeps=substeps)
     assert np.abs(run.scene.data.plastic).max() > 1e-3
     assert run.ticks["environment_energy"].max() < 1e-12
+
+
+JELLY = """<flexcomp name="jelly" type="grid" dim="3" count="3 3 3" spacing=".05 .05 .05" mass=".2"
+  radius=".005" dof="{}"><contact selfcollide="none"/>
+  <elasticity young="{}" poisson=".3" damping="1e-9"/></flexcomp>"""
+
+
+@pytest.mark.parametrize("dof", ["full", "trilinear", "quadratic"])
+def test_a_flex_whose_force_has_no_energy_is_told_by_run_and_check(
+    tmp_path: Path, dof: str
+) -> None:
+    path = tmp_path / "scene.xml"
+    path.write_text(mjcf(TOOL + JELLY.format(dof, "2e4")))
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        scene = hb.load_scene(path)
+    words = f"flex 'jelly' has dof=\"{dof}\", and MuJoCo's force is there no gradient of an energy"
+    assert any(words in str(each.message) for each in warned) == (dof != "full")
+    if dof != "full":
+        gave = unstored_words(scene.model, 0.01)
+        assert gave.startswith("the elasticity of flex 'jelly' gave 10 mJ that it never stored: ")
+        assert "bending" not in gave
+        assert storing_flex(scene.model, 1e-3).startswith('write dof="full"')
+    found = [fault for fault in faults_of(path) if fault.kind == "flex without energy"]
+    assert len(found) == (dof != "full")
+    assert all(words in fault.sentence for fault in found)
+    path.write_text(mjcf(TOOL + JELLY.format(dof, "0")))  # without elasticity nothing is stored
+    assert gradientless_flexes(mujoco.MjModel.from_xml_path(str(path))) == ""
 
 
 BASKET = """<flexcomp name="basket" type="box" dim="2" count="3 3 3" spacing=".1 .1 .1" mass=".02"

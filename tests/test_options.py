@@ -40,6 +40,15 @@ def scene() -> Scene:
     return load_scene("point_mass")
 
 
+def test_a_stated_delay_beyond_all_couplings_is_named_with_the_longest(scene: Scene) -> None:
+    info = replace(SIMULATED, delay=0.1, is_delay_measured=True)
+    clock = SimulatedClock()
+    with pytest.raises(DeviceError, match="states a delay of 100 ms, and at 1000 Hz a coupling is"):
+        RunSetup.resolve(scene, info, None, BridgeOptions(), clock)
+    RunSetup.resolve(scene, replace(info, delay=0.05), None, BridgeOptions(), clock)
+    RunSetup.resolve(scene, info, None, BridgeOptions(rate=500.0), clock)
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [

@@ -100,11 +100,17 @@ def test_a_wrong_axis_is_refused_before_the_force(
     with opened(device, recording=path) as bridge, pytest.raises(hb.SafetyTrip, match=words):
         bridge.run(0.5)
     assert device.gained <= 8e-3
+    summary = bridge.summary()
+    assert (summary.verdict, summary.is_certified) == ("empty", None)
+    assert "passive" not in str(summary)
     recording = hb.read_recording(path)
     assert len(recording.ticks) == 0
     assert [e["event"] for e in recording.events][-3:] == ["probe", "trip", "stop"]
-    assert f"it holds no tick; the guard tripped at tick 0: a small force {words}" in (
-        audit(path).sentence
+    report = audit(path)
+    assert (report.verdict, report.exit_code, report.certified) == ("empty", 1, None)
+    nothing = "the recording holds no tick, so there is nothing to judge"
+    assert report.reason.startswith(
+        f"{nothing}; the guard tripped at tick 0: a small force {words}"
     )
 
 

@@ -99,7 +99,11 @@ NOT_MET = f'<geom name="lamp" size="0.01" pos="3 3 3" contype="4" conaffinity="4
     ("solref", "solimp", "words"),
     [
         *((solref, SOLIMP, ("more energy than the coupling's slack", 'write solref="0.0005 8"'))
-          for solref in ((-20_000.0, -50.0), (-1e6, -500.0), (0.001, 1.0), (0.02, 0.1))),
+          for solref in ((-1e6, -1200.0), (0.001, 1.0))),
+        ((-1000.0, 0.0), SOLIMP, ("bounces (e = 1): as MuJoCo's spring it may rise higher than it",
+          "nothing, if it is to bounce: rigid contacts (without --contact scene) do so")),
+        # exp(-zeta/root * acos(2 zeta^2 - 1)) of a spring that is let go where its force is zero
+        ((0.02, 0.1), SOLIMP, ("bounces (e = 0.74)", 'for no bounce solref="0.0005 8"')),
         ((0.004, 2.0), (0.99, 0.99, 0.001),
          ("larger impedance (0.99, at most 0.91)",
           'write solref="0.0005 8" and solimp="0.9 0.95 0.001"')),

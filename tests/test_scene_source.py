@@ -21,8 +21,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from outside_scenes import RICH, mjcf, obj_bytes, png_bytes, scene_file, stl_bytes
 
+import hapticbridge as hb
 from hapticbridge.audit import audit
 from hapticbridge.errors import SceneError, SceneWarning
+from hapticbridge.run.commands import Couple
 from hapticbridge.run.description import model_digest
 from hapticbridge.scene import load_scene
 from hapticbridge.scene.load import plain_model, read_scene
@@ -312,6 +314,53 @@ def test_a_run_whose_recording_could_not_be_audited_says_so_at_its_start(
     with pytest.warns(UserWarning, match="the recording could not be audited: "):
         recorded(tmp_path / "run.mcap", scene, duration=0.1)
     assert audit(tmp_path / "run.mcap").verdict == "invalid"
+
+
+def _doubled_gravity(model: mujoco.MjModel) -> None:
+    model.opt.gravity[2] *= 2.0
+
+
+def _heavier_by_half(model: mujoco.MjModel) -> None:
+    model.body("tool").mass *= 1.5
+
+
+def _stronger_motor(model: mujoco.MjModel) -> None:
+    model.actuator("m").gainprm[0] = 2.0
+
+
+@pytest.mark.parametrize(
+    ("change", "fields"),
+    [
+        (_doubled_gravity, "opt.gravity"),
+        (_heavier_by_half, "body_mass"),
+        (_stronger_motor, "actuator_gainprm"),
+    ],
+)
+@pytest.mark.parametrize("method", ["implicit", "lossless"])
+def test_a_model_changed_in_mid_run_is_named_by_the_summary_as_by_the_audit(
+    tmp_path: Path, change: Callable[[mujoco.MjModel], None], fields: str, method: str
+) -> None:
+    turned = """<body pos="1 0 0"><joint name="j"/><geom size=".1" mass="1"/></body>"""
+    motor = '<actuator><motor name="m" joint="j" ctrlrange="0 .1"/></actuator>'
+    scene = load_scene(scene_file(tmp_path, mjcf(motor, world=turned)))
+    path, options = tmp_path / "run.mcap", hb.BridgeOptions(method=method)
+    with hb.Bridge(
+        scene, "simulated", clock=hb.SimulatedClock(), recording=path, options=options
+    ) as bridge:
+        bridge.set_input(ctrl={"m": 0.1})
+        bridge.command(Couple(stiffness=300.0, damping=0.6))
+        summary = bridge.run(0.05)
+        assert summary.changed == ""
+        assert "set_input" not in str(summary)
+        change(scene.model)
+        summary = bridge.run(0.1)
+    words = f"{fields} of the scene was changed during the run other than by set_input"
+    assert summary.changed == words
+    assert f"{words}: no recording can repeat that" in str(summary)
+    report = audit(path)
+    assert report.verdict == "invalid"
+    assert report.sentence.endswith(f": {words}")
+    assert "recording was changed" not in report.sentence
 
 
 def test_a_state_that_a_run_leaves_for_its_start_is_told(tmp_path: Path) -> None:

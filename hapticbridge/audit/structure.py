@@ -97,8 +97,6 @@ def file_fault(recording: RecordingFile) -> Fault | None:
     """Returns a fault of the file as a whole, or None."""
     if recording.problems:
         return Fault("the file is damaged: " + "; ".join(recording.problems))
-    if not recording.count:
-        return Fault("the recording is empty: it holds no tick")
     last = recording.last_tick
     # the last rows may be lost although a later event is kept, if that was in an earlier chunk
     may_lack = recording.is_cut or any(e.get("event") == "repaired" for e in recording.events)
@@ -106,9 +104,8 @@ def file_fault(recording: RecordingFile) -> Fault | None:
         tick = event.get("tick")
         is_fitting = tick == last + 1 or (may_lack and isinstance(tick, int) and tick > last)
         if event.get("event") == "stop" and not is_fitting:
-            return Fault(
-                f"the run stopped before tick {event.get('tick')}, the last record is of {last}"
-            )
+            held = f"the last record is of {last}" if recording.count else "no tick is recorded"
+            return Fault(f"the run stopped before tick {event.get('tick')}, {held}")
     return None
 
 

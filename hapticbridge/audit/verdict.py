@@ -48,11 +48,16 @@ from hapticbridge.kernel.record import CLOCK_FIELDS
 from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.format import SHOWN_EVENT
 from hapticbridge.recording.reader import open_hands
-from hapticbridge.run.description import meta_start, requested_of
+from hapticbridge.run.description import (
+    CHANGED_EVENT,
+    changed_words,
+    meta_start,
+    requested_of,
+)
 from hapticbridge.run.summary import Environment, posted_words, was_never_lossless
 from hapticbridge.units import facts_html, format_energy
 
-Verdict = Literal["passive", "unverified", "active", "invalid"]
+Verdict = Literal["passive", "unverified", "active", "empty", "invalid"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +67,9 @@ class AuditReport:
     Attributes:
         path: The recording.
         verdict: ``passive``, ``active`` or ``invalid``; ``unverified`` if the records alone are
-            passive, but the run was not simulated again.
-        environment: ``strict`` (Σ E_k <= 0 held), ``within slack`` or ``active``; None if invalid.
+            passive, but the run was not simulated again; ``empty`` if there is no record to judge.
+        environment: ``strict`` (Σ E_k <= 0 held), ``within slack`` or ``active``; None if invalid
+            or empty.
         sentence: The verdict in a sentence.
         remarks: Further clauses on an undamaged recording: silence, device, energy, end, checks.
         tick: First tick at fault, or None.
@@ -87,7 +93,8 @@ class AuditReport:
         unchecked: Parts that only the re-simulation confirms; empty if there are none. Without a
             re-simulation it names the changes that would pass: those of ``wrench_on_device`` and
             ``share`` that fit each other.
-        certification: Verdict on the device, of several hands on the worst; None if invalid.
+        certification: Verdict on the device, of several hands on the worst; None if invalid or
+            empty.
         trip: Stop by the guard; None without one.
         damping_margin: Smallest share of the device's damping that the coupling leaves at the time
             that the run kept, 1 − needed / b over the kinds of axis. It is negative if more is
@@ -221,9 +228,9 @@ class AuditReport:
 
         1 means nothing was used, 0 is the limit, negative values are beyond it. The device's share
         is ``damping_margin``, if known. The margin is never above 0 for an active verdict, and NaN
-        for an invalid one.
+        for an invalid or empty one.
         """
-        if self.verdict == "invalid":
+        if self.verdict in ("invalid", "empty"):
             return math.nan
         parts = [1.0 - self.slack_share]
         if self.damping_margin is not None:
@@ -240,6 +247,10 @@ def verdict_words(verdict: str, environment: str, port: str) -> str:
     """
     beside = {"passive": environment, "unverified": environment, "active": port}.get(verdict)
     return f"{verdict} ({beside})" if beside else verdict
+
+
+NOTHING_TO_JUDGE = "the recording holds no tick, so there is nothing to judge"
+"""Sentence on an undamaged recording of a run that ended before its first tick."""
 
 
 # End of a run
@@ -363,7 +374,7 @@ def decide_on_hands(
     strict: bool,
 ) -> AuditReport:
     """Decides over the tallies of all hands, as ``decide`` does; the worst verdict counts."""
-    ranks = ("invalid", "active", "unverified", "passive")
+    ranks = ("invalid", "active", "empty", "unverified", "passive")
     tallies = energies if fault is None else ()
     verdicts = [decide(report, fault, each, gap=gap, strict=strict) for each in tallies or (None,)]
     return min(verdicts, key=lambda each: (ranks.index(each.verdict), each.tick or 0))
@@ -377,17 +388,16 @@ def decide(
     gap: str,
     strict: bool,
 ) -> AuditReport:
-    """Decides between ``passive``, ``unverified``, ``active`` and ``invalid``.
+    """Decides between ``passive``, ``unverified``, ``active``, ``empty`` and ``invalid``.
 
     Args:
         report: Report without a verdict.
         fault: Fault that makes the recording invalid, or None.
-        energies: Energies of a recording without a fault.
+        energies: Energies of a recording without a fault; None if it holds no tick.
         gap: Clause with the reason why the run was not simulated again; empty if it was.
         strict: True accepts only (14) itself, not the slack that the device condition leaves.
     """
-    if fault is not None or energies is None:
-        fault = fault or Fault("the recording is empty: it holds no tick")
+    if fault is not None:
         return replace(
             report,
             sentence=fault.reason,
@@ -395,6 +405,8 @@ def decide(
             port=fault.port,
             joules=fault.joules,
         )
+    if energies is None:
+        return replace(report, verdict="empty", sentence=NOTHING_TO_JUDGE)
     unstrict, active, excess = energies.unstrict, energies.active, energies.excess
     state: Environment = "strict" if unstrict is None else "within slack"
     report = replace(report, environment=state, slack_share=energies.slack_share)
@@ -485,7 +497,10 @@ def verdict_on(
         report = replace(report, unchecked=_unchecked(hands[0].run))
         fault = file_fault(recording) or first_contradiction(metadata_statements(recordings))
         fault = fault or _hands_fault(hands)
-        if fault is None:
+        if fault is None and not recording.count and not recording.cut_sentence:
+            untimed = TimingTally(parameters)
+            fault = first_contradiction(event_statements(recording, untimed))
+        elif fault is None and recording.count:
             judged = zip(hands, devices, strict=True)
             energies = [
                 PassivityTally(
@@ -499,17 +514,21 @@ def verdict_on(
                 if fault is None:
                     outcome = replayed()
                     report = replace(report, agreement=outcome.agreement, obstacle=outcome.obstacle)
-                    fault = _replay_fault(outcome)
+                    fault = _replay_fault(outcome, recording.events)
     except RecordingError as error:  # what is damaged may lack metadata
-        fault = file_fault(recording) if recording.problems else Fault(str(error))
+        if recording.count or recording.problems or not recording.is_cut:
+            fault = file_fault(recording) if recording.problems else Fault(str(error))
     gap = f"the run was {report.resimulation}; in its records alone" if report.obstacle else ""
     if report.trip and report.trip.is_unsound:
         gap = "MuJoCo could not simulate the scene to the end; until then"
     report = decide_on_hands(report, fault, energies, gap=gap, strict=strict)
     if report.verdict == "invalid":
-        end = "" if recording.count else unusual_end(report.trip, ())
-        sentence = "; ".join(filter(None, (report.sentence, end)))
-        return replace(report, sentence=sentence, certification=None)
+        return replace(report, certification=None)
+    if report.verdict == "empty":
+        end = unusual_end(report.trip, recording.events)
+        if not end and any(event.get("event") == "stop" for event in recording.events):
+            end = "the run was stopped before its first tick"
+        return replace(report, remarks=(end,) if end else ())
     if report.obstacle:
         report = replace(report, unchecked=report.unchecked or _UNCHECKED_WITHOUT_REPLAY)
     return replace(report, remarks=tuple(filter(None, _remarks(report, recording.events))))
@@ -773,16 +792,17 @@ def _block_fault(block: AuditedBlock, balance: EnergyBalance, events: RunEvents)
     return min(faults, key=lambda fault: fault.tick or 0, default=None)
 
 
-def _replay_fault(outcome: ReplayOutcome) -> Fault | None:
+def _replay_fault(outcome: ReplayOutcome, events: Sequence[Mapping[str, Any]]) -> Fault | None:
     if not outcome.disagrees:
         return None
     if outcome.warning:
         reason = f"simulated again, tick {outcome.tick} is refused: {outcome.warning}"
         return Fault(reason, outcome.tick, outcome.field)
+    changed = next((e.get("fields") for e in events if e.get("event") == CHANGED_EVENT), None)
+    cause = changed_words(str(changed)[:MAX_WORDS] if changed else "")
     return Fault(
         f"simulated again, tick {outcome.tick} differs in {outcome.field} by "
-        f"{outcome.difference:.3g}: the recording was changed, or the scene was changed during "
-        "the run other than by set_input",
+        f"{outcome.difference:.3g}: {'' if changed else 'the recording was changed, or '}{cause}",
         outcome.tick,
         outcome.field,
     )

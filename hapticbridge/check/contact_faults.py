@@ -18,6 +18,7 @@ from hapticbridge.scene.contacts import (
     ROUNDING,
     SOFT_STEPS,
     ContactSetting,
+    bounce_of,
     contact_concerns,
     contact_numbers,
     meeting_pairs,
@@ -193,6 +194,8 @@ def _soft(
     place, also = _place(case, pair, is_soft=True)
     if is_default and len(pairs) > 1:
         also += f"; for all geoms at once: <geom {change}/> in <default>"
+    if bounce := bounce_of(setting.solref):
+        also += f" (which ends its bounce, e = {bounce:.2g})"
     return Fault(kind, place, sentence, change + also)
 
 

@@ -38,6 +38,7 @@ from hapticbridge.scene.first_faults import (
     pump_faults,
     unit_faults,
 )
+from hapticbridge.scene.physics import OWN_VERTICES, gradientless_flexes
 from hapticbridge.scene.treatment import Treatment
 from hapticbridge.units import format_count
 
@@ -74,6 +75,9 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     for name, concern in unmetered_work(case.model).items():
         place = places.with_attribute(name) or places.option(name)
         yield Fault("unmetered work", place, concern + MAY_BE_ACTIVE, f"remove {name}")
+    if concern := gradientless_flexes(case.model):
+        place = places.with_attribute("dof") or places.option("timestep")
+        yield Fault("flex without energy", place, concern, OWN_VERTICES)
 
 
 APART = "a start (pos, or keyframe 'home') with parts apart, limits kept and constraints closed"

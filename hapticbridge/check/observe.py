@@ -23,7 +23,7 @@ from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
 from hapticbridge.run.summary import Ledger
 from hapticbridge.scene import Scene
-from hapticbridge.scene.physics import TendonWatch, WayJump, firm_edges, unstored_words
+from hapticbridge.scene.physics import TendonWatch, WayJump, storing_flex, unstored_words
 
 # Clearance of the tool between opposite walls
 
@@ -235,7 +235,8 @@ def not_finite(
         )
     words = f"scene '{scene.name}' is not finite after tick {tick} of {ticks} of the motion"
     if state is not None and (given := unstored_energy(state[0])) > NOTABLE:
-        words += f"; {unstored_words(scene.model, given)}; {firm_edges(scene.model.opt.timestep)}"
+        change = storing_flex(scene.model, scene.model.opt.timestep)
+        words += f"; {unstored_words(scene.model, given)}; {change}"
     return SceneError(words)
 
 

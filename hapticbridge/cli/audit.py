@@ -43,6 +43,7 @@ _VERDICT_COLOURS = {
     "passive": "green",
     "unverified": "yellow",
     "active": "red",
+    "empty": "bright_black",
     "invalid": "magenta",
     UNREADABLE: "magenta",
 }
@@ -339,7 +340,8 @@ def _print_report(report: AuditReport) -> None:
     colour = _VERDICT_COLOURS[report.verdict]
     is_judged = report.environment and not report.port and not report.credit
     judged = "environment " if is_judged else ""
-    tripped = ", [bold yellow]then the guard stopped the run[/]" if report.trip else ""
+    has_tripped = report.trip and report.verdict != "empty"
+    tripped = ", [bold yellow]then the guard stopped the run[/]" if has_tripped else ""
     out.print(f"{plain(str(report.path))}: {judged}[bold {colour}]{report.words}[/]{tripped}")
     out.print(f"  {plain(report.reason)}")
     if report.obstacle:

@@ -36,6 +36,7 @@ class Standing(StrEnum):
         DELAY_UNKNOWN: Its delay is unknown.
         UNPROVED: Nothing proves that it bears the coupling: no law, or axes without a motor.
         NO_HAND: Its motion is prescribed, so there is nothing to certify.
+        NO_TICK: The run ended before its first tick.
     """
 
     CERTIFIED = "certified"
@@ -49,6 +50,7 @@ class Standing(StrEnum):
     DELAY_UNKNOWN = "delay unknown"
     UNPROVED = "unproved"
     NO_HAND = "no hand"
+    NO_TICK = "no tick"
 
     @property
     def verdict(self) -> bool | None:
@@ -73,6 +75,7 @@ _OPEN = {
     Standing.DAMPING_UNKNOWN: UNKNOWN_DAMPING,
     Standing.DELAY_UNKNOWN: "its delay is unknown ('hapticbridge identify' measures it)",
     Standing.UNPROVED: "nothing proves that it bears the coupling",
+    Standing.NO_TICK: "the run held no tick",
 }
 
 
@@ -259,6 +262,8 @@ def certification_of(
     verdict = is_run_certified(conditions, method)
     if info.is_prescribed:
         standing = Standing.NO_HAND
+    elif not times.ticks:
+        standing = Standing.NO_TICK
     elif kept.is_kept is False:
         standing = Standing.TIME
     elif kept.alarm:

@@ -16,6 +16,7 @@ from hapticbridge.arguments import (
     Rule,
     check_fields,
     checked_value,
+    is_number,
     option,
     rule,
     rule_of,
@@ -184,13 +185,13 @@ class DeviceInfo:
         rotational_damping: Rotational damping at the handle in N m s/rad, >= 0; None if unknown.
         friction: Coulomb friction per axis in N, >= 0; None if unknown.
         resolution: Step of the reported position in m, >= 0 (0: none); None if unknown.
-        force_limit: Largest norm of a commanded force in N, >= 0.
-        torque_limit: Largest norm of a commanded torque in N m, >= 0; by default 0.5.
+        force_limit: Largest norm of a commanded force in N, > 0. The tool gets no more, either.
+        torque_limit: Largest norm of a commanded torque in N m, > 0; by default 0.5.
         speed_limit: Largest possible speed in m/s, >= 0; by default 5. A pose that moves faster
-            than twice this speed stops the run.
+            than twice this speed stops the run; 0 for none.
         rate: The device's own rate in Hz, > 0; None if it follows the bridge.
         delay: Age of a sample when the loop reads it, plus the time until a written wrench acts, in
-            s, >= 0; None if unknown.
+            s, 0 to 1; None if unknown.
         is_delay_measured: True if ``delay`` was measured, as 'hapticbridge identify' does, or is
             exact, as in a simulation; a certificate names a delay that is a statement alone.
         is_prescribed: True if the motion does not react to force.
@@ -221,11 +222,11 @@ class DeviceInfo:
     rotational_damping: float | None = option(None, unit="N m s/rad", least=0.0)
     friction: float | None = option(None, unit="N", least=0.0)
     resolution: float | None = option(None, unit="m", least=0.0)
-    force_limit: float = field(metadata=rule(unit="N", least=0.0))
-    torque_limit: float = option(USUAL_TORQUE_LIMIT, unit="N m", least=0.0)
+    force_limit: float = field(metadata=rule(unit="N", least=0.0, is_open=True))
+    torque_limit: float = option(USUAL_TORQUE_LIMIT, unit="N m", least=0.0, is_open=True)
     speed_limit: float = option(USUAL_SPEED_LIMIT, unit="m/s", least=0.0)
     rate: float | None = option(None, unit="Hz", least=0.0, is_open=True)
-    delay: float | None = option(None, unit="s", least=0.0)
+    delay: float | None = option(None, unit="s", least=0.0, most=1.0)
     is_delay_measured: bool = False
     is_prescribed: bool = False
     is_real: bool = True
@@ -239,6 +240,9 @@ class DeviceInfo:
     grip_axis: DeviceInfo | None = None
 
     def __post_init__(self) -> None:
+        for name, remedy in _WITHOUT_MOTOR.items():
+            if is_number(value := getattr(self, name)) and value == 0:
+                raise DeviceError(f"{name} is 0; it must be > 0: {remedy}")
         check_fields(self, DeviceError)
         axes = _in_order("axes", self.axes, AXES)
         if not axes:
@@ -302,6 +306,15 @@ class DeviceInfo:
         """
         return from_json(cls, text, "device data", DeviceError)
 
+
+_WITHOUT_MOTOR = {
+    "force_limit": (
+        "it limits the force on the tool, too, even if no motor gives it to the hand; a device "
+        "without any motor states is_prescribed=True"
+    ),
+    "torque_limit": "it limits the torque on the tool, too; for the usual 0.5 N m leave it out",
+}
+"""Remedies for limits of 0, by field."""
 
 _NUMBERS = {each.name: rule_of(each) for each in fields(DeviceInfo) if rule_of(each).unit}
 

@@ -140,6 +140,13 @@ def limits_of(
 TIMEGUARD, SATURATED = 1, 2
 """Return codes: no newer sample; a motor is saturated. Success is 0."""
 
+RESET = 3
+"""Index of the flag of mode RESET among those of ``dhdGetStatus``. In this mode a device is not
+calibrated, and waits until its end effector is put to its rest position (SDK, "Device modes")."""
+
+MAX_STATUS = 32
+"""Number of flags that have room; the library's newest version writes 17."""
+
 MAX_WATCHDOG = 255
 """Largest watchdog in steps of ``WATCHDOG_STEP``: the argument is a byte."""
 
@@ -153,6 +160,7 @@ FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "dhdOpenID": (c_int, (c_byte,)),
     "dhdClose": (c_int, (c_byte,)),
     "dhdGetSystemType": (c_int, (c_byte,)),
+    "dhdGetStatus": (c_int, (POINTER(c_int), c_byte)),
     "dhdGetSerialNumber": (c_int, (POINTER(c_ushort), c_byte)),
     "dhdGetMaxForce": (c_double, (c_byte,)),
     "dhdGetMaxTorque": (c_double, (c_byte,)),
@@ -229,6 +237,11 @@ class Dhd(MakerLibrary):
             raise DeviceError(f"{what}: {self.last_error()}")
         return code
 
+    def is_uncalibrated(self, device: int) -> bool:
+        """Returns True if a device waits for its calibration; False also if it reports nothing."""
+        flags = (c_int * MAX_STATUS)()
+        return int(self["dhdGetStatus"](flags, device)) >= 0 and flags[RESET] == 1
+
     def has_watchdog(self, device: int, steps: int) -> bool:
         """Sets the watchdog, 1 to ``MAX_WATCHDOG`` steps; returns False if the device has none."""
         self["dhdEnableExpertMode"]()
@@ -282,7 +295,8 @@ class ForceDimensionDevice:
         saturated: Number of writes that saturated a motor.
 
     Raises:
-        DeviceError: The device cannot be opened, or a required limit is unknown.
+        DeviceError: The device cannot be opened or waits for its calibration, or a required limit
+            is unknown.
         DeviceLost: The device is gone.
     """
 
@@ -307,6 +321,12 @@ class ForceDimensionDevice:
             kind = dhd.require("dhdGetSystemType", self._id, what=what)
             model = MODELS.get(kind, Model(f"Force Dimension device of type {kind}"))
             self._name, self._turns = model.name, model.turns
+            if dhd.is_uncalibrated(self._id):
+                raise DeviceError(
+                    f"{self._name} is not calibrated since its power-on: put its end effector to "
+                    "the rest position until its light stops blinking, or run the maker's "
+                    "'autoinit', then start again"
+                )
             number = c_ushort()
             is_known = dhd["dhdGetSerialNumber"](byref(number), self._id) >= 0
             serial = str(number.value) if is_known else ""

@@ -2,8 +2,8 @@
 
 A VerseGrip that is paired adds its buttons and its orientation. It has no motors, so its three
 rotations are ``sensed``: the tool turns with it, and the hand does not feel the torque. The option
-``turn=0`` leaves them out. A grip that is listed and sends no orientation keeps its last one; one
-that is not listed any more is a lost device.
+``turn=0`` leaves them out. A grip that is not listed any more is a lost device, and so is one that
+stays listed and sends no new orientation (``GRIP_SILENCE``).
 
 The service answers each message with the device's state when the message arrived. So each tick
 sends a force, and its answer is read in the next tick. As with the Falcon, one message carries the
@@ -350,6 +350,14 @@ FORCE_LIMIT = 2.0
 FIRST_ANSWER = 1.0
 """Longest wait in s for the list of devices and for the first state."""
 
+GRIP_SILENCE = 0.5
+"""Time in s without a new orientation after which a VerseGrip counts as lost. A shorter one would
+end runs where its radio link stalls; in a longer one a hand turns it farther without the tool."""
+
+GRIP_WAY = 0.03
+"""Way in m of the handle without which a repeated orientation is no silence. A grip that rests on
+the table repeats it; no hand carries one so far without turning it by a step of 2⁻¹⁴."""
+
 MAX_PERIOD = 0.02
 """Longest period of the loop in s. A force lasts only for its message; at a longer period the
 device would idle between two ticks."""
@@ -423,6 +431,8 @@ class HaplyDevice:
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._sample["quaternion"] = (1.0, 0.0, 0.0, 0.0)
         self._watch = SilenceDetector(link.now())
+        self._turned: tuple[float, Quaternion | None] = link.now(), None
+        self._turned_at = (0.0, 0.0, 0.0)
 
     def start(self, period: float) -> NDArray[np.void]:
         """Requests the state, without force.
@@ -438,6 +448,7 @@ class HaplyDevice:
             )
         self._take()
         self._pending, self._overtaken = None, 0
+        self._turned = self._link.now(), None
         self._fill(self._exchange(force_message(self._listed, (0.0, 0.0, 0.0))))
         self._watch = SilenceDetector(self._link.now())
         self._is_started = True
@@ -448,12 +459,14 @@ class HaplyDevice:
 
         Raises:
             DeviceError: The device was not started, or an answer is not a state.
-            DeviceLost: The connection was lost, the device is no longer listed, or no answer came
-                for ``SILENCE``.
+            DeviceLost: The connection was lost, the device is no longer listed, no answer came for
+                ``SILENCE``, or no new orientation of the VerseGrip for ``GRIP_SILENCE``.
         """
         if not self._is_started:
             raise DeviceError(f"{self._name} is read before it was started; call start() first")
         is_late = self._watch.was_away(self._link.now())
+        if is_late:
+            self._turned = self._link.now(), None
         newest = self._fresh_answer() if is_late else self._take()
         if newest is not None:
             self._fill(newest)
@@ -540,13 +553,29 @@ class HaplyDevice:
         state = state_of(message, self._listed.device_id)
         self._sample["position"] = state.position
         self._sample["buttons"] = state.buttons
-        if self._turns and not state.has_grip:
+        if self._turns:
+            self._turn(state)
+
+    def _turn(self, state: State) -> None:
+        """Takes the orientation of the VerseGrip, which may be gone or silent."""
+        if not state.has_grip:
             raise DeviceLost(
                 f"the VerseGrip is gone: {SERVICE} does not list it any more; pair it again, or "
                 "use the option turn=0"
             )
-        if self._turns and state.orientation is not None:
-            self._sample["quaternion"] = state.orientation
+        now, newest = self._link.now(), state.orientation
+        since, last = self._turned
+        if newest is not None:
+            self._sample["quaternion"] = newest
+        if newest is not None and newest != last:
+            self._turned, self._turned_at = (now, newest), state.position
+        elif now - since > GRIP_SILENCE and (
+            newest is None or math.dist(state.position, self._turned_at) > GRIP_WAY
+        ):
+            raise DeviceLost(
+                f"the VerseGrip is listed, but has sent no new orientation for {GRIP_SILENCE:g} s; "
+                "wake it (move it, press a button), charge it, or use the option turn=0"
+            )
 
 
 # Discovery of Haply's devices in the maker's service

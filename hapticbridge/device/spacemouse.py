@@ -201,8 +201,8 @@ class SpaceMouseDevice:
         link: Open link for its reports.
         name: Name of the device.
         control: Motion that a deflection sets.
-        force_limit: Force limit of the data sheet in N, >= 0; it limits the recorded wrench.
-        torque_limit: Torque limit of the data sheet in N m, >= 0; it limits the recorded wrench.
+        force_limit: Force limit of the data sheet in N, > 0; it limits the recorded wrench.
+        torque_limit: Torque limit of the data sheet in N m, > 0; it limits the recorded wrench.
 
     Raises:
         DeviceError: A number is out of range.

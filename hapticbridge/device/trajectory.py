@@ -274,9 +274,9 @@ class TrajectoryDevice:
 
     Args:
         motion: Poses over time (``read_motion`` reads them from a CSV file).
-        force_limit: Force level in N of the data sheet, >= 0; it limits the wrench on the tool and
+        force_limit: Force level in N of the data sheet, > 0; it limits the wrench on the tool and
             the recorded one.
-        torque_limit: Torque level in N m of the data sheet, >= 0.
+        torque_limit: Torque level in N m of the data sheet, > 0.
         speed_limit: Speed limit of the data sheet in m/s, >= 0.
 
     Raises:
@@ -335,9 +335,9 @@ class ReplayDevice:
         ticks: The recording's rows, ``TICK_DTYPE``, at least two.
         period: The recorded loop's period in s; ``start`` accepts no other.
         name: Name of the recording in messages.
-        force_limit: Force level in N of the data sheet, >= 0; it limits the wrench on the tool and
+        force_limit: Force level in N of the data sheet, > 0; it limits the wrench on the tool and
             the recorded one.
-        torque_limit: Torque level in N m of the data sheet, >= 0.
+        torque_limit: Torque level in N m of the data sheet, > 0.
         speed_limit: Speed limit of the data sheet in m/s, >= 0.
 
     Raises:

@@ -197,7 +197,7 @@ _MAX_KEPT = int(mujoco.mjNSOLVER)
 
 _NEWTON, _CG = int(mujoco.mjtSolver.mjSOL_NEWTON), int(mujoco.mjtSolver.mjSOL_CG)
 
-_PARAMETERS = (
+WRITTEN = (
     *("eq_solref", "eq_solimp", "jnt_solref", "jnt_solimp"),
     *("tendon_solref_lim", "tendon_solimp_lim", "geom_margin", "pair_margin"),
     *("jnt_margin", "tendon_margin"),
@@ -220,7 +220,7 @@ _OF_BLOWS = (
     "rebounds",
 )
 _OWNED = (
-    *(f"own_{name}" for name in _PARAMETERS),
+    *(f"own_{name}" for name in WRITTEN),
     *("eq_type", "row_positions", "row_shifts", "end_velocity", "moving_geoms", "body_velocity"),
     *("leashes", "blocked", "geom_rest", "pair_rest"),
     *("velocity_change", "momentum_change", *_OF_BLOWS),
@@ -246,7 +246,7 @@ RIGID_DTYPE = np.dtype(
         ("statistics", "<i8"),
         ("warmstart", "<i8"),
         ("row_capacity", "<i8"),
-        *((name, "<i8") for name in (*_PARAMETERS, *_OF_MODEL, *_OF_DATA, *_OWNED)),
+        *((name, "<i8") for name in (*WRITTEN, *_OF_MODEL, *_OF_DATA, *_OWNED)),
         ("moving_count", "<i8"),
         ("pair_count", "<i8"),
         ("push_ratio", "<f8"),
@@ -308,7 +308,7 @@ def bind_contact(
             max(6 * model.neq, flex_rows) + model.nv + 2 * model.njnt + 3 * model.ntendon
         )
     owned: dict[str, NDArray[np.generic]] = {
-        f"own_{name}": getattr(model, name).copy() for name in _PARAMETERS
+        f"own_{name}": getattr(model, name).copy() for name in WRITTEN
     }
     for name in ("geom", "pair"):
         owned[f"{name}_rest"] = own_margins(model, name)
@@ -330,7 +330,7 @@ def bind_contact(
     owned["moving_geoms"] = np.flatnonzero(meets & is_moving).astype(np.int32)
     owned["body_velocity"] = np.zeros((model.nbody, 6))
     contact["moving_count"], contact["pair_count"] = owned["moving_geoms"].size, model.npair
-    for name in (*_PARAMETERS, *_OF_MODEL):
+    for name in (*WRITTEN, *_OF_MODEL):
         contact[name] = getattr(model, name).ctypes.data
     for name in _OF_DATA:
         contact[name] = getattr(data, name).ctypes.data
@@ -366,7 +366,7 @@ def rigid_margins(margins: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def restore_model(model: mujoco.MjModel, owned: dict[str, NDArray[np.generic]]) -> None:
     """Puts back what a run writes to the model, from the arrays of ``bind_contact``."""
-    for name in _PARAMETERS:
+    for name in WRITTEN:
         getattr(model, name)[...] = owned[f"own_{name}"]
 
 

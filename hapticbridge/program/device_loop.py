@@ -411,6 +411,8 @@ class DeviceLoop:
         if self._socket is not None:
             with self._lock:
                 self._send(Call.LEAVE)
+            with suppress(OSError):  # it wakes the listener, which close() alone does not
+                self._socket.shutdown(socket.SHUT_RD)
             self._listener.join(1.0)
             self._socket.close()
         if self._process is not None:

@@ -33,7 +33,7 @@ from hapticbridge.scene.physics import (
     STEADY_WAY,
     TendonWatch,
     WayJump,
-    firm_edges,
+    storing_flex,
     unstored_words,
 )
 from hapticbridge.scene.scene import iteration_limit
@@ -423,7 +423,7 @@ def _flex_cause(
     if given <= MOST * float(gained.sum()):
         return None
     step = evidence.parameters.period / evidence.parameters.substeps
-    return Cause("bottomless flex", unstored_words(model, given), firm_edges(step))
+    return Cause("bottomless flex", unstored_words(model, given), storing_flex(model, step))
 
 
 def _cause_without_contact(

@@ -27,8 +27,10 @@ from hapticbridge.demand.methods import RIGID, SCENE, Method, method_named
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CouplingError, HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
+from hapticbridge.kernel.codes import added_actuators
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
 from hapticbridge.kernel.record import SAMPLE_DTYPE
+from hapticbridge.kernel.rigid_contact import WRITTEN
 from hapticbridge.recording import Attachment
 from hapticbridge.recording.format import HANDS_KEY, further_hands
 from hapticbridge.scene import Scene
@@ -64,6 +66,41 @@ def model_digest(model: mujoco.MjModel) -> str:
 
 
 _OF_FILES = re.compile("n?paths|.*_pathadr|nbuffer")
+
+CHANGED_EVENT = "scene_changed"
+"""Event that names, as ``fields``, what a program changed in the compiled model during a run."""
+
+_MAX_WATCHED = 1_000_000
+"""Largest array in bytes that is compared at the end of a run. Larger ones are meshes and textures,
+whose comparison would hold up short runs."""
+
+_OF_A_RUN = ("enableflags", "solver", *WRITTEN)
+"""Fields of the model that a run itself writes to."""
+
+
+def watched_fields(model: mujoco.MjModel) -> dict[str, bytes]:
+    """Returns the numbers of a compiled model by name, without those that a run itself writes to.
+
+    Arrays above ``_MAX_WATCHED``, and the gains of the coupling's actuators are left out.
+    """
+    is_own = np.ones(model.nu, bool)
+    is_own[list(added_actuators(model))] = False
+    watched = {}
+    for prefix, part in (("", model), ("opt.", model.opt)):
+        for name in dir(part):
+            value = None if name.startswith("_") or name in _OF_A_RUN else getattr(part, name)
+            if isinstance(value, int | float):
+                watched[prefix + name] = repr(value).encode()
+            elif isinstance(value, np.ndarray) and value.nbytes <= _MAX_WATCHED:
+                is_gain = name in ("actuator_gainprm", "actuator_biasprm")
+                watched[prefix + name] = (value[is_own] if is_gain else value).tobytes()
+    return watched
+
+
+def changed_words(fields: str) -> str:
+    """Returns a clause on a change of the scene that no recording holds; ``fields`` or empty."""
+    what = f"{fields} of the scene" if fields else "the scene"
+    return f"{what} was changed during the run other than by set_input"
 
 
 def start_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:

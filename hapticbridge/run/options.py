@@ -30,7 +30,7 @@ from hapticbridge.demand.guard import (
     limits_for,
     refuse_simulated_time,
 )
-from hapticbridge.demand.loop_setting import LoopSetting, pulling_loop
+from hapticbridge.demand.loop_setting import LoopSetting, assumed_lag, pulling_loop
 from hapticbridge.demand.methods import (
     SCENE,
     Contact,
@@ -84,6 +84,7 @@ from hapticbridge.scene.rehearsal import (
     toppling_force,
     wrench_sizes,
 )
+from hapticbridge.theory.transfer import MAX_DELAY
 from hapticbridge.units import format_count, format_number, format_si
 
 # Options of a user
@@ -369,7 +370,11 @@ def steady_rotational_stiffness(
 
 
 PRESCRIBED_MOTION = DeviceInfo(
-    name="prescribed motion", axes=AXES, force_limit=0.0, is_prescribed=True, is_real=False
+    name="prescribed motion",
+    axes=AXES,
+    force_limit=UNLIMITED.force,
+    is_prescribed=True,
+    is_real=False,
 )
 """Data sheet of a motion without a device, for studies; it does not react to any force."""
 
@@ -450,6 +455,22 @@ def _suits_own_loop(scene: Scene, method: Method) -> bool:
     """
     is_one = not scene.has_several_hands and scene.joint < 0
     return method.can_be_slow and is_one and scene.credit == 0.0
+
+
+def _refuse_delay(info: DeviceInfo, period: float) -> None:
+    """Refuses a stated delay for which no coupling is computed.
+
+    Raises:
+        DeviceError: Names the longest delay at this rate.
+    """
+    lag = assumed_lag(info, period)
+    most = MAX_DELAY * lag.ticks_per_sample * period
+    if lag.delay > most * (1.0 + ROUNDING) and not info.is_prescribed:
+        raise DeviceError(
+            f"the device '{info.name}' states a delay of {format_si(info.delay or 0.0, 's')}, and "
+            f"at {format_number(1.0 / period)} Hz a coupling is computed for less than "
+            f"{format_si(most, 's')}: state it in seconds, or lower --rate"
+        )
 
 
 def _refuse_buttons(options: BridgeOptions, info: DeviceInfo, *, is_recorded: bool) -> None:
@@ -553,6 +574,7 @@ class RunSetup(StepTimes):
             ticks = scene_ticks_for(substeps * busy_step_time(scene, method, period), period)
         _refuse_buttons(options, info, is_recorded=is_recorded)
         refuse_simulated_time(info, clock)
+        _refuse_delay(info, period)
         if info.loop_period is not None and ticks:  # it waits for no scene, so the run is as slow
             period, ticks = ticks * period, 0
             options = replace(options, rate=1.0 / period, scene_rate=1.0 / period)

@@ -61,12 +61,15 @@ from hapticbridge.recording.recorder import RecordOutput, RecordStream
 from hapticbridge.recording.ring import Snapshot
 from hapticbridge.run.commands import CommandExecutor, CommandQueue, EventApplier
 from hapticbridge.run.description import (
+    CHANGED_EVENT,
     attachments,
+    changed_words,
     describe_hands,
     describe_machine,
     describe_scene,
     describe_start,
     start_state,
+    watched_fields,
 )
 from hapticbridge.run.hands import DeviceGroup
 from hapticbridge.run.options import RunSetup
@@ -328,6 +331,7 @@ class Session:
             resources.callback(self._calls.close)  # ``_open`` says why it is called twice
             self._open(resources)
             resources.callback(self.command_zero_force)
+            self._watched = watched_fields(self.setup.scene.model)
             self._resources = resources.pop_all()
         self._is_begun = self.is_open = True
 
@@ -518,6 +522,8 @@ class Session:
         is_failed = error is not None and self.last_trip is None
         self._note_shown()
         self._note_own_loop()
+        if changed := self._changed_fields():
+            self.event(CHANGED_EVENT, fields=changed)
         self.event(
             "stop",
             reason="error" if is_failed else self.stopped_by,
@@ -528,6 +534,11 @@ class Session:
             dropped=self.stream.dropped,
         )
         self._resources.close()
+
+    def _changed_fields(self) -> str:
+        """Returns the fields of the model that a program changed since the start; else empty."""
+        now = watched_fields(self.setup.scene.model)
+        return ", ".join(name for name, value in self._watched.items() if now.get(name) != value)
 
     def _close_scene(self) -> None:
         if self.beside is not None:
@@ -780,6 +791,7 @@ class Session:
             trip=self.last_trip,
             own_loop=None if self._own_loop is None else self._own_loop.tally.account,
             overlap=self.setup.scene.remaining_overlap(),
+            changed=changed_words(changed) if (changed := self._changed_fields()) else "",
         )
         device = self.device
         remarks = (

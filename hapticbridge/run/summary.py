@@ -163,6 +163,7 @@ class RunOutcome:
         own_loop: Account of a loop of the device's own; None without one.
         overlap: Pairs of the scene that began inside each other and still are; empty without any.
         driver: What the hand's driver lost (``device_remark``), as a clause; empty for nothing.
+        changed: Clause on fields of the model that a program changed meanwhile; empty without any.
     """
 
     ticks: int
@@ -178,10 +179,18 @@ class RunOutcome:
     own_loop: OwnLoopAccount | None = None
     overlap: str = ""
     driver: str = ""
+    changed: str = ""
 
     def added_delay(self, info: DeviceInfo, period: float) -> float:
         """Returns the delay in s that the probe found beyond the stated one."""
         return self.probed.added_delay(info, period) if self.probed else 0.0
+
+
+_UNJUDGED = {
+    "empty": "the run ended before its first tick, so there is nothing to judge",
+    "unverified": "MuJoCo could not simulate the scene to the end",
+}
+"""Reasons of a verdict that is neither ``passive`` nor ``active``."""
 
 
 def posted_words(credit: float) -> str:
@@ -266,6 +275,7 @@ class Summary:
         probe: Result of the probe of the device before the run, as a clause; empty without one.
         overlap: Pairs of the scene that began inside each other and still are; empty without any.
         driver: What the driver lost of frames and forces, as a clause; empty for nothing.
+        changed: Clause on fields of the model that a program changed meanwhile; empty without any.
         hands: Summary of each hand by itself, if several hold the scene. Fault, share of the slack
             and certification of the whole are then those of all of them.
     """
@@ -303,6 +313,7 @@ class Summary:
     probe: str = ""
     overlap: str = ""
     driver: str = ""
+    changed: str = ""
     hands: tuple[Summary, ...] = ()
 
     def at_record(self, record: np.void) -> Summary:
@@ -356,7 +367,7 @@ class Summary:
             what = "the hand got energy for which nothing paid"
             return f"active: {'the simulation made energy' if port == 'environment' else what}"
         if self.verdict != "passive":
-            return f"{self.verdict}: MuJoCo could not simulate the scene to the end"
+            return f"{self.verdict}: {_UNJUDGED[self.verdict]}"
         if self.certification.standing is Standing.NO_HAND:
             return "passive: the scene gave out no more energy than it got"
         if self.is_certified:
@@ -406,6 +417,8 @@ class Summary:
         yield from self._last_lines()
 
     def _verdict_lines(self) -> Iterator[str]:
+        if self.verdict == "empty":
+            return
         tick, port = self.fault or (0, "")
         used = f"at its worst tick {format_share(self.slack_share)} of the slack used"
         used = f", {used}" if self.slack_share else ""
@@ -439,6 +452,8 @@ class Summary:
         skipped = f" ({self.skipped} deadlines skipped)" if self.skipped else ""
         if self.overlap:
             yield "overlap", f"{self.overlap} still; the scene began so"
+        if self.changed:
+            yield "scene", f"{self.changed}: no recording can repeat that"
         yield "overruns", f"{self.overruns}{skipped}, records dropped {self.dropped}"
         if self.probe:
             yield "probe", self.probe
@@ -517,8 +532,11 @@ class Summary:
     def verdict(self) -> str:
         """``passive`` (strict or within slack, without a metered kick), or ``active``.
 
-        It is ``unverified`` if MuJoCo dropped contacts or its numbers were bad.
+        It is ``unverified`` if MuJoCo dropped contacts or its numbers were bad, and ``empty`` if
+        the run held no tick.
         """
+        if not self.ticks:
+            return "empty"
         if self.fault is not None:
             return "active"
         return "unverified" if self.trip and self.trip.is_unsound else "passive"
@@ -595,6 +613,7 @@ class Summary:
             probe=outcome.probed.words if outcome.probed else "",
             overlap=outcome.overlap,
             driver=outcome.driver,
+            changed=outcome.changed,
             grip=parameters.grip,
             device=info.name,
             pulses=(

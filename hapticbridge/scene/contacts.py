@@ -50,6 +50,8 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import SceneError, SceneWarning
 from hapticbridge.kernel.codes import moving_geoms
+from hapticbridge.kernel.jit import source_of
+from hapticbridge.kernel.restitution import NOTABLE_BOUNCE, restitution
 
 STRICT_STEPS = 60.0
 """τ/h above which a contact of moderate stiffness created no energy in any run of the map (its
@@ -216,6 +218,12 @@ def suggested_solref(timestep: float) -> str:
     return f'solref="{SUGGESTED[0] * timestep:g} {SUGGESTED[1]:g}"'
 
 
+def bounce_of(solref: Sequence[float]) -> float:
+    """Returns the coefficient of restitution of a ``solref``; 0 below ``NOTABLE_BOUNCE``."""
+    e = float(source_of(restitution)(*map(float, solref[:2])))
+    return e if e >= NOTABLE_BOUNCE else 0.0
+
+
 class Concern(NamedTuple):
     """Risk of a contact's setting.
 
@@ -273,6 +281,15 @@ def contact_concerns(
                 f"has {_excess(numbers)} than any that stayed passive in tests, and may create "
                 "more energy than the coupling's slack allows",
                 f'{instead} and solimp="0.9 0.95 0.001"',
+            )
+        )
+    elif numbers.grade == "active" and (e := bounce_of(setting.solref)):
+        concerns.append(
+            Concern(
+                f"bounces (e = {e:.2g}): as MuJoCo's spring it may rise higher than it fell, and "
+                "create more energy than the coupling's slack allows",
+                "nothing, if it is to bounce: rigid contacts (without --contact scene) do so as "
+                f"impacts that pay for it; for no bounce {instead}",
             )
         )
     elif numbers.grade == "active":

@@ -49,6 +49,7 @@ from hapticbridge.scene.handle import (
     take_over_mocap,
 )
 from hapticbridge.scene.parameters import apply_parameters
+from hapticbridge.scene.physics import gradientless_flexes
 from hapticbridge.scene.scene import Scene
 from hapticbridge.scene.softness import mixed_forms
 from hapticbridge.scene.source import SourceFile, collect_sources, with_assets
@@ -406,7 +407,7 @@ def compile_scene(
         if not as_is and (excluded := exclude_nested(spec, model, grips[0])):
             changes, model = changes + excluded, spec.compile()
         concerns = [each + MAY_BE_ACTIVE for each in unmetered_work(model).values()]
-        concerns += [*mixed_forms(model), *about_grip]
+        concerns += [*filter(None, [gradientless_flexes(model)]), *mixed_forms(model), *about_grip]
         held = list[str]()
         for each in dict.fromkeys(grips):
             check_model(model, each)

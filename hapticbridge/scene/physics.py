@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.kernel.codes import held_body
+from hapticbridge.kernel.elastic import has_elastic_flex
 from hapticbridge.scene.contacts import REFERENCE_STEPS, impedance_at
 from hapticbridge.units import format_energy, format_si
 
@@ -241,20 +242,49 @@ STEADY_WAY = (
 
 def unstored_words(model: mujoco.MjModel, energy: float) -> str:
     """Returns a clause on energy in J that the flexes gave without having stored it."""
-    bent = np.flatnonzero(model.flex_bendingadr >= 0).tolist() or range(model.nflex)
-    kind = mujoco.mjtObj.mjOBJ_FLEX
-    names = ", ".join(f"'{mujoco.mj_id2name(model, kind, flex) or flex}'" for flex in bent)
+    bent = _bent_flexes(model)
+    names = _flex_names(model, bent or range(model.nflex))
+    why = "once its edges give way, bending has no least energy" if bent else NO_GRADIENT
+    gave = f"gave {format_energy(energy)} that it never stored"
+    return f"the elasticity of flex {names} {gave}: {why}"
+
+
+NO_GRADIENT = "MuJoCo's force is there no gradient of an energy"
+"""Clause on the elasticity of a flex of which nodes move the vertices (``kernel.elastic``)."""
+
+OWN_VERTICES = 'dof="full", with which each vertex moves by itself'
+"""Change of such a flex."""
+
+
+def gradientless_flexes(model: mujoco.MjModel) -> str:
+    """Returns a clause on elastic flexes whose force has no energy; empty if there is none."""
+    loose = np.flatnonzero(model.flex_interp).tolist() if has_elastic_flex(model) else []
+    if not loose:
+        return ""
+    kinds = dict.fromkeys(("", "trilinear", "quadratic")[model.flex_interp[each]] for each in loose)
     return (
-        f"the elasticity of flex {names} gave {format_energy(energy)} that it never stored: once "
-        "its edges give way, bending has no least energy"
+        f'flex {_flex_names(model, loose)} has dof="{", ".join(kinds)}", and {NO_GRADIENT}: what '
+        "its elasticity gives or takes on a closed way counts as stored"
     )
 
 
-def firm_edges(step: float) -> str:
+def _bent_flexes(model: mujoco.MjModel) -> list[int]:
+    is_bent = (model.flex_bendingadr >= 0) & (model.flex_interp == 0)
+    return [int(flex) for flex in np.flatnonzero(is_bent)]
+
+
+def _flex_names(model: mujoco.MjModel, flexes: Iterable[int]) -> str:
+    kind = mujoco.mjtObj.mjOBJ_FLEX
+    return ", ".join(f"'{mujoco.mj_id2name(model, kind, flex) or flex}'" for flex in flexes)
+
+
+def storing_flex(model: mujoco.MjModel, step: float) -> str:
     """Returns the change of a flex with which it gives no energy that it never stored.
 
     ``step`` is the scene's time step in s.
     """
+    if model.flex_interp.any() and not _bent_flexes(model):
+        return f"write {OWN_VERTICES}"
     return (
         f'write <edge equality="true" solref="{REFERENCE_STEPS * step:g} 1"> for it, which holds '
         'its edges more firmly, or elastic2d="both" without an equality of its edges'

@@ -132,7 +132,7 @@ class Rehearsal:
 
 
 def static_load(
-    scene: Scene, parameters: RunParameters, *, has_weight: bool = True
+    scene: Scene, parameters: RunParameters, *, has_weight: bool = True, is_lifted: bool = False
 ) -> NDArray[np.float64]:
     """Returns the wrench that holds the tool of a prepared scene at rest, (6,) in N and N m.
 
@@ -145,9 +145,28 @@ def static_load(
         scene: The prepared scene, at its start.
         parameters: Parameters of the run.
         has_weight: If false, gravity is left out.
+        is_lifted: If true, contacts, limits and dry friction hold nothing.
     """
-    with _gravity(scene.model, is_on=has_weight):
+    with _gravity(scene.model, is_on=has_weight), _holders(scene.model, is_on=not is_lifted):
         return _settled_load(scene, parameters)
+
+
+_HOLDERS = int(
+    mujoco.mjtDisableBit.mjDSBL_CONTACT
+    | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
+)
+
+
+@contextmanager
+def _holders(model: mujoco.MjModel, *, is_on: bool) -> Iterator[None]:
+    """Lets contacts, limits and dry friction hold what they can, or nothing, for a while."""
+    flags = model.opt.disableflags
+    try:
+        model.opt.disableflags |= 0 if is_on else _HOLDERS
+        yield
+    finally:
+        model.opt.disableflags = flags
 
 
 @contextmanager
@@ -324,7 +343,7 @@ def toppling_force(scene: Scene, parameters: RunParameters) -> float:
 
 
 def stiffness_without_hand(
-    model: mujoco.MjModel, data: mujoco.MjData, dofs: NDArray[np.intp], *, has_weight: bool = True
+    model: mujoco.MjModel, data: mujoco.MjData, dofs: NDArray[np.intp]
 ) -> NDArray[np.float64]:
     """Returns −∂Q/∂q of some degrees of freedom at rest, without coupling and constraints.
 
@@ -332,15 +351,7 @@ def stiffness_without_hand(
         model: The prepared scene; it is not changed.
         data: Its state at rest; the positions are kept.
         dofs: Degrees of freedom q.
-        has_weight: If false, the forces Q are without gravity.
     """
-    with _gravity(model, is_on=has_weight):
-        return _stiffness(model, data, dofs)
-
-
-def _stiffness(
-    model: mujoco.MjModel, data: mujoco.MjData, dofs: NDArray[np.intp]
-) -> NDArray[np.float64]:
     start, own, columns = data.qpos.copy(), list(added_actuators(model)), []
     bias = model.actuator_biasprm[own].copy()
     model.actuator_biasprm[own] = 0.0

@@ -403,6 +403,13 @@ class Scene:
         self.differences += (SceneChange(words, "weight", reason),)
         self.reset()
 
+    def for_trial(self) -> Scene:
+        """Returns a copy with a model and data of its own, whose settings a trial may change."""
+        trial = copy.copy(self)
+        trial.model = copy.copy(self.model)
+        trial.data = mujoco.MjData(trial.model)
+        return trial
+
     def with_tool_carried(self) -> Scene:
         """Returns a copy that carries its tool's weight (``carry_tool``), for a trial."""
         trial = copy.copy(self)

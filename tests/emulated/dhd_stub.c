@@ -17,7 +17,7 @@ static struct {
   double gap, gap_speed, grip_command, squeeze, gap_spoiled;
   long steps;
   int type, count, is_open, enabled, gravity, expert, watchdog, has_watchdog, fails, buttons;
-  int stale, forces, closed, gripper;
+  int stale, forces, closed, gripper, uncalibrated;
 } s;
 
 static const char *text = "no error";
@@ -42,6 +42,7 @@ STUB void stub_limits(double told, double told_torque) {
   s.max_force = told; s.max_torque = told_torque;
 }
 STUB void stub_call(double seconds) { s.call = seconds; }
+STUB void stub_uncalibrate(int is_waiting) { s.uncalibrated = is_waiting; }
 STUB void stub_count(int count) { s.count = count; }
 STUB void stub_fail(int is_failing) { s.fails = is_failing; }
 STUB void stub_stale(int getters) { s.stale = getters; }
@@ -109,6 +110,11 @@ STUB int dhdOpenID(char id) {
 }
 STUB int dhdClose(char id) { (void)id; s.is_open = 0; s.closed++; return 0; }
 STUB int dhdGetSystemType(char id) { return called(id) < 0 ? -1 : s.type; }
+STUB int dhdGetStatus(int *status, char id) {
+  for (int i = 0; i < 17; i++) status[i] = i < 3; /* powered, connected, started */
+  status[3 + !s.uncalibrated] = 1;                /* RESET or IDLE */
+  return called(id);
+}
 STUB int dhdGetSerialNumber(unsigned short *number, char id) { *number = 4711; return called(id); }
 STUB double dhdGetMaxForce(char id) { (void)id; return s.max_force; }
 STUB double dhdGetMaxTorque(char id) { (void)id; return s.max_torque; }

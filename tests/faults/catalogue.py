@@ -683,7 +683,7 @@ def probed(name: str, change: Callable[[], Change], hand: Hand) -> Fault:
         rig.is_probed = True
         forced(change, hand)(rig)
 
-    return Fault(name, do, "refuses", "it holds no tick", UNWATCHED, cause=0, energy=0.01)
+    return Fault(name, do, "refuses", "nothing to judge", UNWATCHED, cause=0, energy=0.01)
 
 
 PROBED = (

@@ -193,8 +193,8 @@ class SimulatedDevice:
         dof: 6, or 3 for a device without rotation.
         delay: Whole samples from a write until the motors act, 0 to 100. The data sheet calls a
             delay unknown, and then the device is not judged.
-        force_limit: Force limit of the data sheet in N, >= 0.
-        torque_limit: Torque limit of the data sheet in N m, >= 0.
+        force_limit: Force limit of the data sheet in N, > 0.
+        torque_limit: Torque limit of the data sheet in N m, > 0.
         speed_limit: Speed limit of the data sheet in m/s, >= 0.
 
     Raises:
