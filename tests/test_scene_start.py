@@ -15,7 +15,7 @@ import hapticbridge as hb
 from hapticbridge.check.findings import find_faults
 from hapticbridge.scene import load_scene
 from hapticbridge.scene.scene import Scene
-from hapticbridge.scene.start import row_name
+from hapticbridge.scene.start import row_name, start_on_constraints
 
 TOOL = """<body name="tool" pos=".5 0 .1"><freejoint/>
   <geom type="box" size=".02 .02 .02" mass=".1"/><site name="grip"/></body>"""
@@ -522,3 +522,16 @@ def test_a_summary_says_what_still_overlaps(
         summary = bridge.summary()
     assert summary.overlap == (words if depth else "")
     assert ("overlap             " in str(summary)) == bool(depth)
+
+
+def test_a_rod_that_starts_end_on_in_a_wall_turns_out_of_it_by_the_shortest_way() -> None:
+    """Its contact points along the rod, so that the linear step of its hinge has no end."""
+    text = """<mujoco><worldbody>
+    <geom name="wall" type="box" size=".05 .2 .2" pos=".245 0 .03"/>
+    <body><joint name="hinge" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass="4"/></body>
+    </worldbody></mujoco>"""
+    start = start_on_constraints(mujoco.MjModel.from_xml_string(text))
+    assert start.positions is not None
+    closed = np.arccos((0.195 - 0.02) / 0.2)  # the rod's round end touches the wall
+    assert abs(start.positions[0]) == pytest.approx(closed, abs=0.01)

@@ -574,7 +574,7 @@ def model_addresses(
         "tree_dofadr": np.ascontiguousarray(model.tree_dofadr, dtype=np.int32),
         "tree_dofnum": np.ascontiguousarray(model.tree_dofnum, dtype=np.int32),
         "tree_mass": _masses_of_free_trees(model),
-        "dof_turns": _turning_dofs(model),
+        "dof_turns": turning_dofs(model),
     }
     return values, owned
 
@@ -596,7 +596,7 @@ def _masses_of_free_trees(model: mujoco.MjModel) -> NDArray[np.float64]:
     return np.ascontiguousarray(np.where(is_free & ~armature, masses, 0.0), dtype=np.float64)
 
 
-def _turning_dofs(model: mujoco.MjModel) -> NDArray[np.int32]:
+def turning_dofs(model: mujoco.MjModel) -> NDArray[np.int32]:
     """Returns 1 for each degree of freedom that is a rotation, 0 for others."""
     kinds, dofs = model.jnt_type[model.dof_jntid], np.arange(model.nv)
     is_shift = kinds == mujoco.mjtJoint.mjJNT_SLIDE

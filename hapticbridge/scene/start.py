@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.kernel.mujoco_c import turning_dofs
 from hapticbridge.scene.checks import NOTABLE_OVERLAP, Overlap, listed, overlaps
 from hapticbridge.scene.compile import reset
 from hapticbridge.scene.treatment import SceneChange
@@ -30,6 +31,10 @@ CLOSED = 1e-9
 
 MAX_STEPS = 100
 """Number of steps of a projection. Closed loops take 5 to 20; some that cannot close take all."""
+
+MAX_TURN = 0.5
+"""Largest angle in rad by which a step of a projection turns a joint. A larger step leaves the
+place where it is linear: a hinge whose contact points away from its turn went round twice."""
 
 MAX_NAMED = 4
 """Number of joints and bodies that are named one by one. More are counted."""
@@ -153,11 +158,13 @@ def _projected(trial: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64
 
 def _approach(trial: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, int], float]:
     """Takes steps onto the active constraints; returns what is left of each violation."""
+    turns = turning_dofs(trial) != 0
     for _ in range(MAX_STEPS):
         mujoco.mj_forward(trial, data)
         if not CLOSED < np.abs(data.qacc).max(initial=0.0) < np.inf:
             break
-        mujoco.mj_integratePos(trial, data.qpos, data.qacc, 1.0)
+        turn = float(np.abs(data.qacc[turns]).max(initial=0.0))
+        mujoco.mj_integratePos(trial, data.qpos, data.qacc, MAX_TURN / max(turn, MAX_TURN))
     return _violations(trial, data)
 
 
