@@ -396,7 +396,8 @@ class Timekeeping:
             )
         else:
             is_behind = any(each.delay for each in self.in_time)
-            givers = "late samples and forces" + ", and the scene behind the delay," * is_behind
+            givers = "late samples and forces, or a tool that moved or turned far within a tick,"
+            givers += " and the scene behind the delay," * is_behind
             reason = f"{givers} may have given the hand {given}"
         if self.silence and self.share >= MANY_KEPT and not self.sample_rate:
             return f"{NOT_KEPT}: {self.silence.sentence}; check its link and its power ({reason})"
