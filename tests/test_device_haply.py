@@ -411,6 +411,20 @@ def test_real_sockets_run_and_are_logged(tmp_path: Path, monkeypatch: pytest.Mon
     assert " > 7b" in log.read_text()
 
 
+def test_a_service_that_is_asked_nothing_for_a_while_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    # as while the first orientation of a VerseGrip is compiled for
+    monkeypatch.setattr(transport, "OPEN_TIMEOUT", 0.3)
+    service = HaplyService({"049D": SimulatedDevice()})
+    with serving(service) as (port, _drop):
+        link = transport.WebSocketLink.open("localhost", port, "the service")
+        assert json.loads(link.wait(5.0) or "")["session_id"] == 7
+        assert link.wait(0.6) is None
+        link.send('{"session": {"configure": {"profile": {"name": "later"}}}}')
+        assert link.wait(5.0)
+        assert service.profile == "later"
+        link.close()
+
+
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("localhost", 0))

@@ -21,6 +21,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.demand import timekeeping
 from hapticbridge.demand.certificate import default_coupling, is_certified
 from hapticbridge.demand.certification import Standing, certification_of
+from hapticbridge.demand.guard import Limits
 from hapticbridge.demand.loop_setting import fresh_share
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import SafetyTrip
@@ -595,3 +596,46 @@ def test_the_handle_slips_until_a_late_tick_is_paid(
     assert slips[-1] == pytest.approx(ends, rel=0.1)
     moved = [np.ptp(ticks[name][1:, 0]) for name in ("device_position", "handle_position")]
     assert moved[0] - moved[1] == pytest.approx(lost, rel=0.3)
+
+
+FLUNG = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body>
+      <freejoint/>
+      <geom size=".02" mass="1e-3"/>
+      <site name="grip"/>
+      <body pos="0 .4 .2">
+        <joint name="wing" axis="1 0 0" damping=".007"/>
+        <geom type="capsule" size=".02" fromto="0 0 0 0 2 0" mass="2e-6"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="wing"/></actuator>
+  <keyframe><key name="home" ctrl="5"/></keyframe>
+</mujoco>
+"""
+"""A tool of 1 g that a motor of 5 N m turns by up to 0.44 rad within a tick."""
+
+
+@pytest.mark.parametrize("substeps", [1, 5])
+def test_a_flung_tool_is_no_matter_of_time(tmp_path: Path, substeps: int) -> None:
+    scene, path = tmp_path / "flung.xml", tmp_path / "run.mcap"
+    scene.write_text(FLUNG)
+    summary = recorded(path, scene, duration=0.05, substeps=substeps, limits=Limits())
+    report = audit(path)
+    assert report.timekeeping is not None
+    kept = summary.timekeeping
+    assert (kept.share, kept.fresh, kept.mean_delay, kept.mean_jitter) == (1.0, 1.0, 0.0, 0.0)
+    assert 1e-3 < kept.delay_energy == pytest.approx(report.timekeeping.delay_energy, rel=1e-6)
+    assert summary.is_certified is report.certified is False
+    assert kept.cause == timekeeping.TOO_FAR
+    for text in (str(summary), report.reason):
+        assert timekeeping.TOO_FAR in text
+        assert "less force of what pushes the tool" in text
+        assert "time" not in text.partition(timekeeping.TOO_FAR)[2].partition(";")[0]
+        assert "late" not in text
+    # with a microsecond of lateness, as on any clock, it is one of the causes
+    real = replace(kept, mean_jitter=1e-6).fault
+    assert "late samples and forces, or a tool that moved or turned far within a tick," in real

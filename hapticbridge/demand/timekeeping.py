@@ -40,7 +40,8 @@ from hapticbridge.units import format_number, format_si
 
 NOT_KEPT = "the run did not keep its time"
 SCENE_BEHIND = "behind the device's delay the scene created energy"
-"""Words that name this fault."""
+TOO_FAR = "the scene moved or turned the tool too far within a tick"
+"""Words that name this fault; the last is left where all was in time and no delay is stated."""
 
 SLOW_MOTION = 0.95
 """Share of its speed below which a slower scene is felt to be in slow motion, without unit."""
@@ -139,7 +140,10 @@ class Alarm(StrEnum):
     @property
     def words(self) -> str:
         """Name of the finding in a clause."""
-        return "its force came late, reversed or in steps, or the hand shook it faster than 8 Hz"
+        return (
+            "its force came late, reversed or in steps, or the hand jerked it, or shook it faster "
+            "than 8 Hz"
+        )
 
     @property
     def sentence(self) -> str:
@@ -148,13 +152,13 @@ class Alarm(StrEnum):
             return (
                 "the force was taken away because the device did not move as it was pushed: an "
                 "axis is reversed or exchanged (check the axes and signs of the device), the force "
-                "comes very late, or the hand shook it faster than 8 Hz"
+                "comes very late, or the hand jerked it, or shook it faster than 8 Hz"
             )
         return (
             "the force was lowered because the device swung: it answered late, or in coarse "
-            "steps, an axis is reversed, or the hand shook it faster than 8 Hz; check the signs of "
-            "its axes, lower --stiffness, and measure its delay and resolution ('hapticbridge "
-            "identify')"
+            "steps, an axis is reversed, or the hand jerked it, or shook it faster than 8 Hz; "
+            "check the signs of its axes, lower --stiffness, and measure its delay and resolution "
+            "('hapticbridge identify')"
         )
 
 
@@ -312,8 +316,9 @@ class Timekeeping:
     @property
     def cause(self) -> str:
         """Clause on what refutes the certificate of a device that bears the coupling in time."""
-        is_behind = any(each.delay for each in self.in_time)
-        return SCENE_BEHIND if is_behind and self._is_timely else NOT_KEPT
+        if self.silence or not self._is_timely:
+            return NOT_KEPT
+        return SCENE_BEHIND if any(each.delay for each in self.in_time) else TOO_FAR
 
     @property
     def _late(self) -> str:
@@ -375,6 +380,11 @@ class Timekeeping:
                 f"{SCENE_BEHIND}, and it may have given the hand {given}, which no slack pays "
                 "there; 'hapticbridge check' looks for what creates it"
             )
+        if self.cause == TOO_FAR:
+            return (
+                f"{TOO_FAR}, and the wrench of that tick may have given the hand {given}; try less "
+                "force of what pushes the tool"
+            )
         at_times = (
             f"at {format_number(self.rate)} Hz{f' ({self._late})' if self._late else ''} it would "
             "need"
@@ -390,7 +400,8 @@ class Timekeeping:
             )
         else:
             is_behind = any(each.delay for each in self.in_time)
-            givers = "late samples and forces" + ", and the scene behind the delay," * is_behind
+            givers = "late samples and forces, or a tool that moved or turned far within a tick,"
+            givers += " and the scene behind the delay," * is_behind
             reason = f"{givers} may have given the hand {given}"
         if self.silence and self.share >= MANY_KEPT and not self.sample_rate:
             return f"{NOT_KEPT}: {self.silence.sentence}; check its link and its power ({reason})"

@@ -96,6 +96,7 @@ class WebSocketLink:
             ) from None
         try:
             local_socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            local_socket.settimeout(None)  # or the reader's thread ends after a second of silence
             opening = client.connect(
                 f"ws://{host}:{port}",
                 sock=local_socket,
