@@ -129,7 +129,9 @@ def test_a_simulated_clock_that_begins_anew_is_no_clock_that_was_not_set(tmp_pat
     stamps = [0, 10**7, 2 * 10**7, 0, 10**7]  # as after a reset of the simulator
     messages = [(at, pose_message(k, 0.0)) for (at, _), k in zip(ramp(), stamps, strict=True)]
     (file,) = bag(tmp_path / "walk", {"/hand": messages}).glob("*.mcap")
-    with pytest.raises(DeviceError, match="message 3 of /hand: time 0 s after 0.02 s; times must"):
+    with pytest.raises(
+        DeviceError, match=r"message 3 of /hand: time 0 s after 0\.02 s; times must"
+    ):
         read_bag(file)
 
 
