@@ -425,6 +425,19 @@ def test_parts_that_begin_within_their_margin_start_at_it(
     assert data.body("tool").xpos[2] == pytest.approx(0.103, abs=2e-4)  # its own rest
 
 
+def test_start_within_an_o_margin_stays_because_rigid_contacts_have_none(tmp_path: Path) -> None:
+    path = scene_file(
+        tmp_path,
+        """<mujoco><option o_margin=".01"><flag override="enable"/></option><worldbody>
+        <geom type="plane" size="1 1 .1"/><body name="tool" pos="0 0 .1"><freejoint/>
+        <geom type="box" size=".1 .1 .1" mass=".5"/><site name="grip"/></body></worldbody>
+        </mujoco>""",
+    )
+    scene = load_scene(path)
+    assert started_said(scene) == []
+    assert scene.data.body("tool").xpos[2] == pytest.approx(0.1, abs=1e-9)
+
+
 def test_box_between_two_walls_without_room_is_held_there_and_said(tmp_path: Path) -> None:
     scene = load_scene(scene_file(tmp_path, scene_text(CAUGHT)))
     assert depth(scene) == pytest.approx(0.01, abs=1e-6)

@@ -564,10 +564,12 @@ def overlaps(
     """Returns the pairs that overlap by more than a depth in m, the deepest first.
 
     ``data`` must be after MuJoCo's position stage. Each pair of geoms or flexes is listed once.
-    With ``has_margin`` depths are measured from the margin, where MuJoCo's contacts rest.
+    With ``has_margin`` depths are measured from the margin, where MuJoCo's contacts rest; not from
+    ``o_margin``, which rigid contacts set to 0.
     """
     by_words: dict[str, Overlap] = {}
     pairs = {frozenset(pair) for pair in zip(model.pair_geom1, model.pair_geom2, strict=True)}
+    has_margin &= not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE
     margins = [float(each.includemargin) if has_margin else 0.0 for each in data.contact]
     found = [(m - float(each.dist), m, each) for m, each in zip(margins, data.contact, strict=True)]
     for size, margin, contact in sorted(found, key=lambda each: -each[0]):
