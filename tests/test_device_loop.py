@@ -383,7 +383,7 @@ def test_a_tool_that_was_surely_put_elsewhere_is_doubted_once() -> None:
         device.show(-START)
     with (
         DeviceLoop("simulated", is_simulated=True) as device,
-        pytest.warns(UserWarning, match="positions are in m"),
+        pytest.warns(UserWarning, match=r"at \[0\.0, 0\.0, 100\.0\] m: positions are in m$"),
     ):
         device.show([0.0, 0.0, 100.0])
     assert device.credit == pytest.approx(0.05)

@@ -127,6 +127,16 @@ def test_some_messages_without_stamps_are_told_and_a_simulated_clock_from_0_is_n
         read_bag(file)
 
 
+def test_a_simulated_clock_that_begins_anew_is_no_clock_that_was_not_set(tmp_path: Path) -> None:
+    stamps = [0, 10**7, 2 * 10**7, 0, 10**7]  # as after a reset of the simulator
+    messages = [(at, pose_message(k, 0.0)) for (at, _), k in zip(ramp(), stamps, strict=True)]
+    (file,) = bag(tmp_path / "walk", {"/hand": messages}).glob("*.mcap")
+    with pytest.raises(
+        DeviceError, match=r"message 3 of /hand: time 0 s after 0\.02 s; times must"
+    ):
+        read_bag(file)
+
+
 @pytest.mark.parametrize("jump", [3 * 10**7, -3600 * 10**9])
 def test_a_log_that_jumps_leaves_messages_with_stamps_in_the_order_of_the_file(
     tmp_path: Path, jump: int

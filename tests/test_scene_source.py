@@ -230,6 +230,19 @@ def test_digest_changes_with_every_number_of_a_model_but_the_names_of_its_files(
     assert model_digest(model) not in seen
 
 
+@pytest.mark.parametrize("compiler", ["", "<compiler meshdir='meshes'/>"])
+@pytest.mark.parametrize("name", ["set/main.xml", "./set/main.xml", "../{}/set/main.xml"])
+def test_a_parts_own_files_are_found_whatever_path_names_the_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, compiler: str
+) -> None:
+    part = compiler + MESH.format("meshes/a.stl")  # relative to the part, as PyMJCF reads it
+    scene_file(tmp_path, mjcf("<include file='parts/arm.xml'/>", body=MESHED), "set/main.xml")
+    scene_file(tmp_path, PART.format(part), "set/parts/arm.xml")
+    scene_file(tmp_path, stl_bytes(), "set/parts/meshes/a.stl")
+    monkeypatch.chdir(tmp_path)
+    assert load_scene(name.format(tmp_path.name)).model.nmesh == 1
+
+
 OUTSIDE: Layout = {
     "scenes/main.xml": mjcf(
         "<!-- as <mesh file='/gone/old.stl'/> and <include file='../../../../far.xml'/> were -->",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -384,6 +385,57 @@ def test_parts_that_do_not_touch_by_the_files_own_flag_stay_inside_each_other(
     off = '<option><flag contact="disable"/></option>'
     text = scene_text(CUP).replace("<mujoco>", f"<mujoco>{off}")
     assert started_said(load_scene(scene_file(tmp_path, text))) == []
+
+
+@pytest.mark.parametrize("where", ["geom", "pair", "both geoms"])
+@pytest.mark.parametrize("contact", ["rigid", "scene"])
+def test_parts_that_begin_within_their_margin_start_at_it(
+    tmp_path: Path, where: str, contact: Literal["rigid", "scene"]
+) -> None:
+    # MuJoCo's contacts rest at their margin: a cube on a floor begins 3 mm inside it
+    geom, pair = (
+        'margin=".003"',
+        '<contact><pair geom1="floor" geom2="cube" margin=".003"/></contact>',
+    )
+    half = 'margin=".0015"'
+    floor, cube, rest = {
+        "geom": ("", geom, ""), "pair": ("", "", pair), "both geoms": (half, half, "")
+    }[where]  # fmt: skip
+    path = scene_file(
+        tmp_path,
+        f"""<mujoco><option cone="elliptic"/><worldbody>
+        <geom name="floor" type="plane" size="1 1 .1" {floor}/><body name="tool" pos="0 0 .1">
+        <freejoint/><geom name="cube" type="box" size=".1 .1 .1" mass=".5" {cube}/>
+        <site name="grip"/></body></worldbody>{rest}</mujoco>""",
+    )
+    scene = load_scene(path)
+    assert started_said(scene) == [
+        "start where geom 'floor' and geom 'cube' are 3 mm closer than their margin of 3 mm → "
+        "closed",
+        "start of body 'tool': moved by 3 mm",
+    ]
+    assert scene.data.body("tool").xpos[2] == pytest.approx(0.103, abs=1e-6)
+    with pytest.warns(UserWarning, match="3 mm closer than their margin of 3 mm at the start, and"):
+        load_scene(path, as_is=True)
+    with hb.Bridge(path, contact=contact, clock=hb.SimulatedClock()) as bridge:
+        assert bridge.run(0.5).verdict == "passive"
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 2000)
+    assert data.body("tool").xpos[2] == pytest.approx(0.103, abs=2e-4)  # its own rest
+
+
+def test_start_within_an_o_margin_stays_because_rigid_contacts_have_none(tmp_path: Path) -> None:
+    path = scene_file(
+        tmp_path,
+        """<mujoco><option o_margin=".01"><flag override="enable"/></option><worldbody>
+        <geom type="plane" size="1 1 .1"/><body name="tool" pos="0 0 .1"><freejoint/>
+        <geom type="box" size=".1 .1 .1" mass=".5"/><site name="grip"/></body></worldbody>
+        </mujoco>""",
+    )
+    scene = load_scene(path)
+    assert started_said(scene) == []
+    assert scene.data.body("tool").xpos[2] == pytest.approx(0.1, abs=1e-9)
 
 
 def test_box_between_two_walls_without_room_is_held_there_and_said(tmp_path: Path) -> None:

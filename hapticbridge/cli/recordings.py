@@ -228,7 +228,7 @@ class Export:
             del facts["odd"]
             print_json(facts | done.odd)
         else:
-            frames = f"{sum(done.episodes)} frames at {shot.fps} Hz"
+            frames = f"{format_count(sum(done.episodes), 'frame')} at {shot.fps} Hz"
             episodes = format_count(len(done.episodes), "episode")
             out.print(f"wrote {plain(str(done.folder))}: {episodes}, {frames}")
         _tell_odd(done.odd)

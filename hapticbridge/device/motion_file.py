@@ -508,10 +508,11 @@ def read_bag(path: Path, topic: str = "") -> Motion:
             f"{path}: the poses of {topic} are in {len(found)} frames, {choices(found)}; write the "
             "bag with those in one of them"
         )
-    unset = np.flatnonzero(times == 0)
-    # a simulated clock begins at 0, and may stay there for some messages
-    is_before = unset.size < len(times) and unset.size == np.argmax(times != 0)
-    if unset.size and not (is_before and times[unset.size] <= MAX_SILENCE):
+    zero, set_at = np.flatnonzero(times == 0), np.flatnonzero(times)
+    following = np.append(times[set_at], np.iinfo(np.int64).max)[np.searchsorted(set_at, zero)]
+    # a simulated clock begins at 0, may stay there for some messages, and may begin anew
+    unset = zero[following > MAX_SILENCE]
+    if unset.size:
         raise DeviceError(
             f"{path}: the stamp is 0 in {unset.size} of the {times.size} messages of {topic}, "
             f"first in message {unset[0]}, as before a clock is set; write the bag without them"

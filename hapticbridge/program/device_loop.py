@@ -458,12 +458,13 @@ class DeviceLoop:
         if self._has_warned or (step < FAR and np.abs(position).max() < 100.0 * FAR):
             return
         self._has_warned = True
-        warnings.warn(
-            f"the tool is shown at {position.round(3).tolist()} m, {step:.3g} m from the pose "
-            "before: positions are in m, and is_placed=True says that a tool was put elsewhere, as "
-            "after a reset",
-            stacklevel=3,
-        )
+        words = f"the tool is shown at {position.round(3).tolist()} m"
+        if step >= FAR:
+            words += f", {step:.3g} m from the pose before"
+        words += ": positions are in m"
+        if step >= FAR:
+            words += ", and is_placed=True says that a tool was put elsewhere, as after a reset"
+        warnings.warn(words, stacklevel=3)
 
     def _handle_in(self, state: np.void) -> tuple[Array, Array]:
         """Returns pose and velocity of the handle; until it is placed, those that it will have."""

@@ -541,32 +541,45 @@ class Overlap:
         words: Names of both sides.
         bodies: Ids of both bodies; -1 for a flex.
         is_explicit: True for a ``<pair>`` of the file, which no exclusion of bodies switches off.
+        margin: Distance in m at which the contact rests, if the depth is measured from there.
     """
 
     depth: float
     words: str
     bodies: tuple[int, int]
     is_explicit: bool = False
+    margin: float = 0.0
 
     def __str__(self) -> str:
-        return f"{self.words} overlap by {1e3 * self.depth:.3g} mm"
+        size = f"{1e3 * self.depth:.3g} mm"
+        if self.margin > 0.0:
+            margin = f"{1e3 * self.margin:.3g} mm"
+            return f"{self.words} are {size} closer than their margin of {margin}"
+        return f"{self.words} overlap by {size}"
 
 
-def overlaps(model: mujoco.MjModel, data: mujoco.MjData, depth: float) -> list[Overlap]:
+def overlaps(
+    model: mujoco.MjModel, data: mujoco.MjData, depth: float, *, has_margin: bool = False
+) -> list[Overlap]:
     """Returns the pairs that overlap by more than a depth in m, the deepest first.
 
     ``data`` must be after MuJoCo's position stage. Each pair of geoms or flexes is listed once.
+    With ``has_margin`` depths are measured from the margin, where MuJoCo's contacts rest; not from
+    ``o_margin``, which rigid contacts set to 0.
     """
     by_words: dict[str, Overlap] = {}
     pairs = {frozenset(pair) for pair in zip(model.pair_geom1, model.pair_geom2, strict=True)}
-    for contact in sorted(data.contact, key=lambda contact: float(contact.dist)):
-        if contact.dist >= -depth:
+    has_margin &= not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE
+    margins = [float(each.includemargin) if has_margin else 0.0 for each in data.contact]
+    found = [(m - float(each.dist), m, each) for m, each in zip(margins, data.contact, strict=True)]
+    for size, margin, contact in sorted(found, key=lambda each: -each[0]):
+        if size <= depth:
             break
         sides = list(zip(contact.geom.tolist(), contact.flex.tolist(), strict=True))
         words = " and ".join(_side_name(model, geom, flex) for geom, flex in sides)
         first, second = (int(model.geom_bodyid[geom]) if geom >= 0 else -1 for geom, _ in sides)
         is_explicit = frozenset(geom for geom, _ in sides) in pairs
-        overlap = Overlap(-float(contact.dist), words, (first, second), is_explicit)
+        overlap = Overlap(size, words, (first, second), is_explicit, margin)
         by_words.setdefault(words, overlap)
     return list(by_words.values())
 

@@ -669,7 +669,7 @@ def exclude_nested(
 
 def announce_overlaps(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[SceneChange, ...]:
     """Returns the change in the treatment of what overlaps at the start."""
-    if overlapping := overlaps(model, data, NOTABLE_OVERLAP):
+    if overlapping := overlaps(model, data, NOTABLE_OVERLAP, has_margin=True):
         words = (
             f"start where {listed(overlapping)}: pushed out at once → held, and eased out as far "
             "as joints and the energy that the scene has dissipated allow"

@@ -228,7 +228,8 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
         sources = collect_sources(path)  # first: it refuses what MuJoCo must not open
         check_text(sources)
         with quiet() as told:
-            spec = mujoco.MjSpec.from_file(str(path))
+            # with a relative path MuJoCo looks for files beside a part in a wrong folder
+            spec = mujoco.MjSpec.from_file(str(path.absolute()))
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
         raise SceneError(f"cannot read scene '{path}': {clause(error)}") from None
     check_options(spec)

@@ -84,8 +84,9 @@ def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Sta
     with the inertia matrix M, the constraints' Jacobian J and their violation r. Weight, springs,
     motors and friction give no force. Without them a scene's own soft constraints come to rest at
     r = 0 too. An equality that cannot be closed is left out and described. Contacts come last, and
-    only if pairs overlap by ``NOTABLE_OVERLAP`` then. They are left out if with them a limit or an
-    equality stays violated, or no pair comes farther apart, as of a peg within the hull of a hole.
+    only if pairs are by ``NOTABLE_OVERLAP`` closer than their margins then. They are left out if
+    with them a limit or an equality stays violated, or no pair comes farther apart, as of a peg
+    within the hull of a hole.
 
     Args:
         model: Compiled scene; it is not changed.
@@ -93,7 +94,7 @@ def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Sta
     """
     trial, data = _without_forces(model)
     start, first = data.qpos.copy(), _violations(trial, data)
-    inside = overlaps(trial, data, NOTABLE_OVERLAP)
+    inside = overlaps(trial, data, NOTABLE_OVERLAP, has_margin=True)
     if not inside and max(first.values(), default=0.0) <= VIOLATION:
         return Start(None, (), ())
     end, last = start, first
@@ -114,7 +115,9 @@ def start_on_constraints(model: mujoco.MjModel, *, is_moved: bool = True) -> Sta
         for row, size in first.items()
         if size > VIOLATION and row not in still and row[0] != "joint"
     ]
-    left = {each.words for each in overlaps(model, _at(model, end), NOTABLE_OVERLAP)}
+    left = {
+        each.words for each in overlaps(model, _at(model, end), NOTABLE_OVERLAP, has_margin=True)
+    }
     if closed := [each for each in inside if each.words not in left]:
         words.append(f"start where {listed(closed)} → closed")
     limited = {row[1] for row, size in first.items() if row[0] == "joint" and size > VIOLATION}
@@ -147,9 +150,9 @@ def _projected(trial: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64
     closed = np.array(data.qpos)
     trial.opt.disableflags = own
     mujoco.mj_forward(trial, data)
-    if before := overlaps(trial, data, NOTABLE_OVERLAP):
+    if before := overlaps(trial, data, NOTABLE_OVERLAP, has_margin=True):
         sizes = _approach(trial, data)
-        after = overlaps(trial, data, NOTABLE_OVERLAP)
+        after = overlaps(trial, data, NOTABLE_OVERLAP, has_margin=True)
         is_closed = max(sizes.values(), default=0.0) <= VIOLATION
         if not is_closed or not _is_farther_apart(after, before):
             data.qpos[:] = closed
