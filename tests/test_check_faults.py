@@ -581,7 +581,7 @@ def _carried(sentence: str) -> float:
 
 TILTED = """<geom name="wall" type="box" size=".05 .2 .2" pos=".245 0 .03"/>
 <body name="tool" euler="0 {} 0"><joint name="turn" axis="0 1 0"/><geom name="arm" type="capsule"
-  fromto="0 0 0 .2 0 0" size=".02" mass="4"/><site name="grip" pos=".15 0 0"/></body>"""
+  fromto="0 0 0 .2 0 0" size=".02" mass="1.5"/><site name="grip" pos=".15 0 0"/></body>"""
 
 
 @pytest.mark.parametrize("angle", [0.0, 70.0])
@@ -597,7 +597,7 @@ def test_a_weight_is_that_which_a_run_names_also_from_a_moved_start(
     device = SimulatedDevice()
     with Bridge(tmp_path / "scene.xml", device, coupling, clock=SimulatedClock()) as bridge:
         load, _ = bridge.setups[0].load_at_rest(bridge.session.parameters)
-    assert _carried(told) == pytest.approx(load, rel=1e-3)
+    assert _carried(told) == pytest.approx(load, rel=2e-3)  # it has three digits
 
 
 @pytest.mark.parametrize("spring", [0.0, 100.0, 1000.0])

@@ -45,6 +45,7 @@ REASONS = {
     "realtime/doctor.py: wait()": "a clock's: at most one period",
     "kernel/machine_code.py: for line in sys.stdin": "the end of the process that asks closes it",
     "run/endpoint.py: super().wait()": "simulated time waits for nothing",
+    "program/device_loop.py: self._socket.shutdown(socket.SHUT_RD)": "that of a socket returns",
     "run/endpoint.py: self._thread.join()": "it looks for the end every REPORT_PERIOD",
     "run/endpoint.py: time.sleep(LAST_WORDS / 10)": "until LAST_WORDS is over",
     "program/device_loop.py: time.sleep(REPEAT)": DAEMON,

@@ -83,17 +83,16 @@ def watched_fields(model: mujoco.MjModel) -> dict[str, bytes]:
 
     Arrays above ``_MAX_WATCHED``, and the gains of the coupling's actuators are left out.
     """
-    is_own = np.ones(model.nu, bool)
-    is_own[list(added_actuators(model))] = False
-    watched = {}
+    added, watched = list(added_actuators(model)), {}
     for prefix, part in (("", model), ("opt.", model.opt)):
         for name in dir(part):
             value = None if name.startswith("_") or name in _OF_A_RUN else getattr(part, name)
             if isinstance(value, int | float):
                 watched[prefix + name] = repr(value).encode()
             elif isinstance(value, np.ndarray) and value.nbytes <= _MAX_WATCHED:
-                is_gain = name in ("actuator_gainprm", "actuator_biasprm")
-                watched[prefix + name] = (value[is_own] if is_gain else value).tobytes()
+                if name in ("actuator_gainprm", "actuator_biasprm"):
+                    value = np.delete(value, added, axis=0)
+                watched[prefix + name] = value.tobytes()
     return watched
 
 
