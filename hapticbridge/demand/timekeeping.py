@@ -41,7 +41,9 @@ from hapticbridge.units import format_number, format_si
 NOT_KEPT = "the run did not keep its time"
 SCENE_BEHIND = "behind the device's delay the scene created energy"
 TOO_FAR = "the scene moved or turned the tool too far within a tick"
-"""Words that name this fault; the last is left where all was in time and no delay is stated."""
+"""Words that name the fault of a run; the last where all was in time and no delay is stated."""
+
+_SHAKEN = "the hand jerked it, or shook it faster than 8 Hz"
 
 SLOW_MOTION = 0.95
 """Share of its speed below which a slower scene is felt to be in slow motion, without unit."""
@@ -140,10 +142,7 @@ class Alarm(StrEnum):
     @property
     def words(self) -> str:
         """Name of the finding in a clause."""
-        return (
-            "its force came late, reversed or in steps, or the hand jerked it, or shook it faster "
-            "than 8 Hz"
-        )
+        return f"its force came late, reversed or in steps, or {_SHAKEN}"
 
     @property
     def sentence(self) -> str:
@@ -152,13 +151,12 @@ class Alarm(StrEnum):
             return (
                 "the force was taken away because the device did not move as it was pushed: an "
                 "axis is reversed or exchanged (check the axes and signs of the device), the force "
-                "comes very late, or the hand jerked it, or shook it faster than 8 Hz"
+                f"comes very late, or {_SHAKEN}"
             )
         return (
             "the force was lowered because the device swung: it answered late, or in coarse "
-            "steps, an axis is reversed, or the hand jerked it, or shook it faster than 8 Hz; "
-            "check the signs of its axes, lower --stiffness, and measure its delay and resolution "
-            "('hapticbridge identify')"
+            f"steps, an axis is reversed, or {_SHAKEN}; check the signs of its axes, lower "
+            "--stiffness, and measure its delay and resolution ('hapticbridge identify')"
         )
 
 

@@ -292,7 +292,6 @@ class ForceDimensionDevice:
 
     Attributes:
         effector_mass: Mass carried by gravity compensation in kg; None if unknown.
-        saturated: Number of writes that saturated a motor.
 
     Raises:
         DeviceError: The device cannot be opened or waits for its calibration, or a required limit

@@ -18,6 +18,7 @@ from hapticbridge.demand.methods import RIGID
 from hapticbridge.demand.rehearsal import RunPoint, rehearsal_parameters
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import OK, added_actuators, held_body
+from hapticbridge.kernel.elastic import has_elastic_flex
 from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.kernel.parameters import MAX_SUBSTEPS
@@ -396,6 +397,9 @@ class _FileMotion:
             return found
         moved, (spread, energies) = self.start.apart(self.end)[0], self._other_motion()
         lost = min(energies) - self._energy(scene.data)
+        least = max(NOTABLE_LOSS, SPREAD * abs(energies[1] - energies[0]))
+        if has_elastic_flex(self.model):  # its energy is not in MuJoCo's
+            least = math.inf
         allowed = np.where(spread < CHAOS, SPREAD * spread, math.inf)
         names = [str(self.model.body(i).name) or str(i) for i in range(self.model.nbody)]
         worst = [int(i) for i in np.argsort(-sizes) if sizes[i] > 1.0]
@@ -407,7 +411,7 @@ class _FileMotion:
                 if sizes[i] > allowed[i]
             ),
             incomparable=tuple(names[i] for i in worst if sizes[i] <= allowed[i]),
-            lost=lost if lost > max(NOTABLE_LOSS, SPREAD * abs(np.diff(energies)[0])) else 0.0,
+            lost=lost if lost > least else 0.0,
         )
 
     @property
