@@ -324,7 +324,7 @@ def test_check_writes_a_leaner_scene_that_runs(
     lean = tmp_path / "lean.xml"
     code, out, _ = call("check", *studded, "--write", lean)
     assert code == 0
-    run = f"hapticbridge run {lean} --grip tip"
+    run = f"hapticbridge run {lean} --grip tip --device simulated:path={studded[-1]}"
     for words in ("What could go", "nothing only seen", "may go with the picture", f"next: {run}"):
         assert words in out
     assert "rivet" not in lean.read_text(encoding="utf-8")

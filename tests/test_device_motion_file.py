@@ -24,7 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 import hapticbridge as hb
 from hapticbridge.check.case import motion_for
 from hapticbridge.device import open_device, read_motion
-from hapticbridge.device.motion_file import read_bag
+from hapticbridge.device.motion_file import POSE, read_bag
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import DeviceError, RecordingError
 from hapticbridge.kernel.record import TICK_DTYPE
@@ -74,10 +74,10 @@ def ramp(count: int = 5, start: int = 10**18, late: int = 7) -> list[tuple[int, 
     return [(at + late, pose_message(at, 1e-3 * i)) for i, at in enumerate(stamps)]
 
 
-def write_ramp(writer: Any, encoding: str = "cdr") -> None:
+def write_ramp(writer: Any, encoding: str = "cdr", kind: str = POSE) -> None:
     """Writes a whole bag of poses on ``/hand``."""
     writer.start("ros2", "a test")
-    schema = writer.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", b"")
+    schema = writer.register_schema(kind, "ros2msg", b"")
     channel = writer.register_channel("/hand", encoding, schema)
     for time, data in ramp():
         writer.add_message(channel, time, data, time)
@@ -185,6 +185,17 @@ def test_the_only_topic_with_messages_is_the_motion(tmp_path: Path) -> None:
     assert open_device(f"trajectory:{file}").info.duration == pytest.approx(0.08, abs=1e-12)
     with pytest.raises(DeviceError, match="/a has 0 of at least two messages"):
         open_device(f"trajectory:{file}:/a")
+
+
+def test_a_bag_in_the_place_of_a_table_or_of_ros_1_is_told(tmp_path: Path) -> None:
+    (file,) = bag(tmp_path / "bag", {"/hand": ramp()}).glob("*.mcap")
+    with pytest.raises(DeviceError, match=f"not CSV; 'trajectory:{file}' reads it"):
+        open_device(f"simulated:path={file}")
+    file = tmp_path / "older.mcap"
+    with file.open("wb") as stream:
+        write_ramp(McapWriter(stream), "ros1", "geometry_msgs/PoseStamped")
+    with pytest.raises(DeviceError, match="those of ROS 1 are not read"):
+        open_device(f"trajectory:{file}")
 
 
 def test_a_bag_that_is_no_motion_is_refused_with_what_it_holds(tmp_path: Path) -> None:

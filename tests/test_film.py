@@ -72,7 +72,7 @@ def test_the_tool_is_seen_where_the_record_says_at_the_moment_asked_for(
         x, y, z = records["tool_position"][tick]
         scale = 60 / np.tan(np.radians(22.5)) / (0.5 - z)
         assert seen == pytest.approx((60 - scale * y, 80 + scale * x), abs=3)
-    with pytest.raises(RecordingError, match="no camera 'below'; it has cameras: 'above'"):
+    with pytest.raises(RecordingError, match=f"'{sway}' has no camera 'below'; it has cameras: "):
         draw(sway, tmp_path / "below.png", Shot(camera="below"))
     code, _, err = call(*asked)
     assert (code, "exists" in err) == (2, True)

@@ -99,21 +99,17 @@ def print_lean(lean: Lean) -> None:
     )
 
 
-def print_written(lean: Lean, written: VariantVerdict, path: Path, *, is_quiet: bool) -> None:
-    """Prints what the written scene is like, read back, and how to run it."""
+def print_written(lean: Lean, written: VariantVerdict, path: Path, command: str) -> None:
+    """Prints what the written scene is like, read back, and the command that runs it, if any."""
     err.print(
         f"wrote {plain(str(path))}: read back, {written.percent:.0f} % of the cost, felt "
         f"{format_number(written.jnd, 2)} JND"
     )
-    if is_quiet:
+    if not command:
         return
-    setting, original = lean.draft.setting, lean.judge.original.setting
-    command = f"hapticbridge run {shlex.quote(str(path))}"
-    if lean.draft.grip != "grip":
-        command += f" --grip {shlex.quote(lean.draft.grip)}"
-    if setting.period != original.period:
-        command += f" --rate {1 / setting.period:g}"
-    out.print(f"next: {plain(command)}")
+    period = lean.draft.setting.period
+    rate = "" if period == lean.judge.original.setting.period else f" --rate {1 / period:g}"
+    out.print(f"next: {plain(command + rate)}")
 
 
 def _verdict(trial: VariantVerdict) -> str:
@@ -442,7 +438,7 @@ class Check:
             print_cost(cost)
             print_faults(faults, is_urdf=b"<robot" in source.sources[0].data)
             if is_sound:
-                out.print(f"next: {plain(self._next)}")
+                out.print(f"next: {plain(self._running(self.scene, self.grip))}")
         lean = self._looked_for(case, budget) if wants_lean else None
         written = None if lean is None else self._print_lean(lean)
         if self.as_json:
@@ -457,14 +453,13 @@ class Check:
         is_worse = written is not None and written.verdict not in (MAY_GO, SAVES_NOTHING)
         return 1 if not is_sound or is_worse or (wants_lean and lean is None) else 0
 
-    @property
-    def _next(self) -> str:
-        """Command that runs the scene, with the same motion."""
-        grip = "" if self.grip == "grip" else f" --grip {shlex.quote(self.grip)}"
+    def _running(self, scene: str, grip: str) -> str:
+        """Returns the command that runs a scene, with the same motion."""
+        grip = "" if grip == "grip" else f" --grip {shlex.quote(grip)}"
         is_table = self.motion is not None and self.motion.suffix == ".csv"
         led = f"{'simulated:path=' if is_table else 'trajectory:'}{self.motion or ''}"
         device = f" --device {shlex.quote(led)}" if self.motion else ""
-        return f"hapticbridge run {shlex.quote(self.scene)}{grip}{device}"
+        return f"hapticbridge run {shlex.quote(scene)}{grip}{device}"
 
     def _looked_for(self, case: SceneUnderCheck, budget: float) -> Lean | None:
         """Looks for what could go; None, and a sentence, where the scene must be mended first."""
@@ -491,7 +486,8 @@ class Check:
             err.print(f"nothing may go: {plain(str(self.write))} is not written")
             return None
         written = write_lean(lean, self.write, overwrite=self.overwrite)
-        print_written(lean, written, self.write, is_quiet=self.as_json)
+        command = "" if self.as_json else self._running(str(self.write), lean.draft.grip)
+        print_written(lean, written, self.write, command)
         return written
 
     def _coupling(self, period: float) -> Coupling:

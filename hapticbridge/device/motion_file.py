@@ -225,7 +225,11 @@ def _read_lines(path: Path) -> list[str]:
     except FileNotFoundError:
         raise DeviceError(f"{path}: no such file") from None
     except UnicodeDecodeError as error:
-        line = path.read_bytes()[: error.start].count(b"\n") + 1
+        content = path.read_bytes()
+        if content.startswith(_MCAP_MAGIC):
+            reader = f"'trajectory:{path}' reads it"
+            raise DeviceError(f"{path}: is MCAP and not CSV; {reader}") from None
+        line = content[: error.start].count(b"\n") + 1
         kind = "-".join(error.encoding.upper().split("-")[:2])
         raise DeviceError(f"{path}, line {line}: not {kind} text, so not a CSV file") from None
     except (OSError, ValueError) as error:
@@ -417,7 +421,7 @@ def read_recorded(path: Path) -> tuple[NDArray[np.void], float]:
 
 # Bag of ROS 2
 
-POSE = "geometry_msgs/msg/PoseStamped"
+POSE, _POSE_OF_ROS_1 = "geometry_msgs/msg/PoseStamped", "geometry_msgs/PoseStamped"
 
 MAX_SILENCE = 86_400 * 10**9
 """Longest time in ns between two stamps of one clock, as of a simulated one after its stamp of 0:
@@ -473,7 +477,8 @@ def read_bag(path: Path, topic: str = "") -> Motion:
         )
     if not poses:
         listed = choices(f"{name} ({kind})" for name, kind in kinds.items())
-        raise DeviceError(f"{path}: has no topic of {POSE}; topics: {listed}")
+        older = "; those of ROS 1 are not read" if _POSE_OF_ROS_1 in kinds.values() else ""
+        raise DeviceError(f"{path}: has no topic of {POSE}{older}; topics: {listed}")
     rows: dict[str, list[tuple[int, int, str, tuple[float, ...]]]]
     rows = {name: [] for name in ([topic] if topic else poses)}
     topic = topic or poses[0]  # until a message is of another
@@ -508,6 +513,21 @@ def read_bag(path: Path, topic: str = "") -> Motion:
             f"{path}: the poses of {topic} are in {len(found)} frames, {choices(found)}; write the "
             "bag with those in one of them"
         )
+    _refuse_unset(path, topic, times)
+    table = np.empty((len(times), 8))
+    table[:, 0] = (times - times[0]) * 1e-9
+    table[:, 1:] = np.array(numbers)[:, [0, 1, 2, 6, 3, 4, 5]]  # ROS has w last
+    if fault := first_fault(table):
+        raise DeviceError(f"{path}, message {fault[0]} of {topic}: {fault[1]}")
+    return _plausible(table, path)
+
+
+def _refuse_unset(path: Path, topic: str, times: NDArray[np.int64]) -> None:
+    """Refuses stamps in ns of which some are of no clock, and others of one.
+
+    Raises:
+        DeviceError: Some are.
+    """
     zero, set_at = np.flatnonzero(times == 0), np.flatnonzero(times)
     following = np.append(times[set_at], np.iinfo(np.int64).max)[np.searchsorted(set_at, zero)]
     # a simulated clock begins at 0, may stay there for some messages, and may begin anew
@@ -517,12 +537,6 @@ def read_bag(path: Path, topic: str = "") -> Motion:
             f"{path}: the stamp is 0 in {unset.size} of the {times.size} messages of {topic}, "
             f"first in message {unset[0]}, as before a clock is set; write the bag without them"
         )
-    table = np.empty((len(times), 8))
-    table[:, 0] = (times - times[0]) * 1e-9
-    table[:, 1:] = np.array(numbers)[:, [0, 1, 2, 6, 3, 4, 5]]  # ROS has w last
-    if fault := first_fault(table):
-        raise DeviceError(f"{path}, message {fault[0]} of {topic}: {fault[1]}")
-    return _plausible(table, path)
 
 
 def _topics(path: Path) -> Iterator[tuple[str, str]]:

@@ -462,7 +462,7 @@ class Camera:
         width, height = size
         model = stage.model
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        self._camera = FREE if name is None else _camera_id(model, name)
+        self._camera = FREE if name is None else _camera_id(stage, name)
         self._shown = mujoco.MjvOption()
         shadows = model.vis.quality
         shadows.shadowsize = min(shadows.shadowsize, SHADOW)
@@ -484,11 +484,14 @@ class Camera:
         return np.array(self.renderer.render(), dtype=np.uint8)
 
 
-def _camera_id(model: mujoco.MjModel, name: str) -> int:
+def _camera_id(stage: Stage, name: str) -> int:
+    model = stage.model
     names = [model.camera(index).name for index in range(model.ncam)]
     if name not in names:
         there = f"cameras: {', '.join(map(repr, filter(None, names)))}" if any(names) else "none"
-        raise RecordingError(f"the scene has no camera '{name}'; it has {there}")
+        raise RecordingError(
+            f"the scene of '{stage.recording.path}' has no camera '{name}'; it has {there}"
+        )
     return names.index(name)
 
 

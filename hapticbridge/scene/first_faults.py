@@ -119,7 +119,7 @@ def _motor_change(
         low, high = model.actuator_ctrlrange[control]
         if not low <= rest <= high:
             return "a smaller forcerange, or a start at which it does not push"
-    return f"ctrl=\"{number(rest)}\"{name} in keyframe 'home', or a smaller forcerange"
+    return f"ctrl=\"{number(rest)}\"{name} in a keyframe 'home', or a smaller forcerange"
 
 
 # Units of the tool and of hinges
