@@ -425,6 +425,21 @@ def test_parts_that_begin_within_their_margin_start_at_it(
     assert data.body("tool").xpos[2] == pytest.approx(0.103, abs=2e-4)  # its own rest
 
 
+def test_start_that_overlaps_beside_a_margin_is_told_by_its_overlap(tmp_path: Path) -> None:
+    path = scene_file(
+        tmp_path,
+        """<mujoco><option cone="elliptic"/><worldbody>
+        <geom name="floor" type="plane" size="1 1 .1" margin=".003"/>
+        <body name="tool" pos="0 0 .08"><freejoint/><geom name="cube" type="box" size=".1 .1 .1"
+        mass=".5"/><site name="grip"/></body></worldbody></mujoco>""",
+    )
+    scene = load_scene(path)
+    assert started_said(scene) == [
+        "start where geom 'floor' and geom 'cube' overlap by 20 mm, with a margin of 3 mm → closed",
+        "start of body 'tool': moved by 23 mm",
+    ]
+
+
 def test_start_within_an_o_margin_stays_because_rigid_contacts_have_none(tmp_path: Path) -> None:
     path = scene_file(
         tmp_path,

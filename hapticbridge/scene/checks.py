@@ -551,11 +551,14 @@ class Overlap:
     margin: float = 0.0
 
     def __str__(self) -> str:
-        size = f"{1e3 * self.depth:.3g} mm"
-        if self.margin > 0.0:
-            margin = f"{1e3 * self.margin:.3g} mm"
-            return f"{self.words} are {size} closer than their margin of {margin}"
-        return f"{self.words} overlap by {size}"
+        margin, inside = self.margin, self.depth - self.margin
+        if margin == 0.0:
+            return f"{self.words} overlap by {1e3 * self.depth:.3g} mm"
+        if inside < NOTABLE_OVERLAP:
+            size = f"{1e3 * self.depth:.3g} mm"
+            return f"{self.words} are {size} closer than their margin of {1e3 * margin:.3g} mm"
+        beside = f"with a margin of {1e3 * margin:.3g} mm"
+        return f"{self.words} overlap by {1e3 * inside:.3g} mm, {beside}"
 
 
 def overlaps(
