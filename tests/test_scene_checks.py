@@ -118,6 +118,7 @@ def test_names_of_earlier_recordings_are_found() -> None:
 def test_grip_on_what_cannot_move_is_refused(tmp_path: Path, body: str, where: str) -> None:
     message = refusal_of(tmp_path, mjcf(body=body))
     assert message.startswith(f"grip 'grip' sits on {where}, which cannot move; put it on a body")
+    assert message.endswith("in the place of mocap") == ("mocap" in body)
 
 
 def test_grip_on_a_rigid_part_of_a_moving_body_is_accepted(tmp_path: Path) -> None:
