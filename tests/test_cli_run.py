@@ -176,6 +176,16 @@ def test_carrying_the_tool_is_advised_with_what_it_leaves_and_only_where_it_is_n
     assert ("from what hangs or lies on the tool, whose weight is carried" in words) == is_carried
 
 
+def test_carrying_a_tool_that_the_file_carries_is_not_advised(call: Called, tmp_path: Path) -> None:
+    scene = tmp_path / "laden.xml"
+    scene.write_text(LADEN.format(0.03).replace('name="tray"', 'name="tray" gravcomp="1"'))
+    _, _, err = call("run", scene, "--fast", "--duration", 0.05)
+    words = " ".join(err.split())
+    assert "what hangs or lies on the tool weighs most of the 3.9" in words
+    assert 'gravcomp="1" in these bodies carries them' in words
+    assert "--no-tool-weight" not in words
+
+
 HAMMER = """<mujoco><option timestep="0.001"/><worldbody><body pos="0 0 0.2"><freejoint/>
 <geom type="box" pos="0.3 0 0" size="0.015 0.015 0.04" mass="{}"/><site name="grip"/></body>
 </worldbody></mujoco>"""

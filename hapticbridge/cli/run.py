@@ -282,6 +282,9 @@ def _findings(source: SceneSource, scene: Scene) -> tuple[str, ...]:
 HEAVY = 0.25
 """Share of the force or torque limit above which a sentence tells the tool's load; no unit."""
 
+EASED = 0.05
+"""Share of that load which carrying the tool must take off to be advised; no unit."""
+
 
 def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]:
     """Yields a sentence on the load of the tool at rest, for its force and torque if heavy."""
@@ -313,28 +316,26 @@ def _heavy_load(setup: RunSetup, parameters: RunParameters, part: int) -> str:
             f"at rest the hand bears {felt}, {beside} beside the handle, most of "
             "it from motors, springs or parts of the scene that push the tool"
         )
+    borne = f"that the hand bears {beside} beside the handle"
+    lift = 'gravcomp="1" in these bodies carries them'
     if scene.is_carried:
         return (
             f"at rest the hand bears {felt}, {beside} beside the handle, from what "
-            'hangs or lies on the tool, whose weight is carried; gravcomp="1" in these bodies '
-            "carries them"
+            f"hangs or lies on the tool, whose weight is carried; {lift}"
         )
     left = wrench_sizes(static_load(scene.with_tool_carried(), parameters))
+    alone = f"--no-tool-weight carries the tool alone (tried: the hand then bears {in_hand(left)})"
+    if 2.0 * left[part] > load:
+        verb = "makes" if part else "weighs"
+        is_eased = left[part] < (1.0 - EASED) * load
+        remedy = f"{lift}, and {alone}" if is_eased else lift
+        return f"what hangs or lies on the tool {verb} most of the {felt} {borne}; {remedy}"
     own, whole = tool_masses(scene.model, scene.grip)
     subject = "this tool"
     if own < 0.5 * whole:
         subject += f" with its links ({weight(whole)}, without them {weight(own)})"
     verb = f"turns the hand with {felt}" if part else f"weighs {felt} in the hand"
-    cause = f"{subject} {verb}, which holds it {beside}"
-    if 2.0 * left[part] > load:
-        verb = "makes" if part else "weighs"
-        cause = (
-            f"what hangs or lies on the tool {verb} most of the {felt} that the hand bears {beside}"
-        )
-    return (
-        f"{cause} beside the handle; --no-tool-weight carries the tool alone (tried: the hand "
-        f"then bears {in_hand(left)})"
-    )
+    return f"{subject} {verb}, which holds it {beside} beside the handle; {alone}"
 
 
 def is_mouse(device: str) -> bool:

@@ -102,8 +102,8 @@ _LIMIT_INPUTS = (
 )
 _EASE_SPRINGS = (
     "the coupling's springs held {} at the start or after resets, by what the tool bears: "
-    "--no-tool-weight carries its weight, a start without other loads leaves them slack, and "
-    "--energy-limit is what the hand may get"
+    '--no-tool-weight carries its own weight, gravcomp="1" that of bodies on it, a start without '
+    "other loads leaves them slack, and --energy-limit is what the hand may get"
 )
 _FIND_PUMP = (
     "the scene itself created {} until then: 'hapticbridge check SCENE' looks for what pumps, and "
