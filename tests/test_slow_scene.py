@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from audit_cases import COUPLING, ScriptedDevice, SlowClock, recorded, verdict_of
@@ -523,6 +524,28 @@ def test_the_command_line_names_the_rate(call: Called, tmp_path: Path) -> None:
     code, out, _ = call("audit", path)
     assert code == 0
     assert "the scene at 100 Hz and 100 % of its speed" in out
+
+
+def test_the_usual_coupling_is_that_of_the_start_whatever_was_tried_or_stepped_before(
+    call: Called, tmp_path: Path
+) -> None:
+    # a link of 20 g on a slide: that much is in the hand
+    text = """<mujoco><option gravity="0 0 -3"/><worldbody><body><freejoint/>
+      <geom size=".03" mass=".3"/><body pos=".05 0 0"><joint type="slide" axis="1 0 1"/>
+      <geom size=".01" mass=".02"/><site name="grip"/></body></body></worldbody></mujoco>"""
+    path, run = tmp_path / "scene.xml", tmp_path / "run.mcap"
+    path.write_text(text)
+    words = ("--fast", "--duration", 0.1, "--scene-rate", 250, "--json")
+    assert call("run", path, *words, "--record", run)[0] == 0
+    assert call("audit", run)[0] == 0
+    scene = hb.load_scene(path)
+    for _ in range(200):
+        mujoco.mj_step(scene.model, scene.data)
+    with hb.Bridge(scene, scene_rate=250.0, clock=hb.SimulatedClock()) as bridge:
+        stepped = bridge.setups[0].coupling.stiffness
+    assert float(read_recording(run).meta["stiffness"]) == stepped
+    hand = 0.55 + (SimulatedDevice().info.mass or 0.0)
+    assert stepped == pytest.approx(0.8 / (0.004**2 * (1.0 / 0.02 + 1.0 / hand)), rel=1e-3)
 
 
 def test_the_command_line_warns_above_twice_the_steady_stiffness(call: Called) -> None:

@@ -29,6 +29,7 @@ from hapticbridge.recording.reader import BLOCK
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.scene.checks import first_pump, unmetered_work
 from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
+from hapticbridge.scene.handle import constraint_rows
 from hapticbridge.scene.physics import (
     STEADY_WAY,
     TendonWatch,
@@ -37,6 +38,7 @@ from hapticbridge.scene.physics import (
     unstored_words,
 )
 from hapticbridge.scene.scene import iteration_limit
+from hapticbridge.scene.start import constraint_name
 from hapticbridge.theory.bounds import NEEDED_SHARE
 from hapticbridge.units import format_count, format_energy, format_number
 
@@ -52,6 +54,7 @@ Kind = Literal[
     "unmetered work",
     "jumping tendon",
     "bottomless flex",
+    "constraint",
     "solver",
     "unknown",
 ]
@@ -325,7 +328,8 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
     if cause := own or _jump_cause(evidence, report, window, gained):
         return cause
     if share < MOST:
-        return _cause_without_contact(evidence, report, window, where)
+        constraint = _constraint_cause(evidence, report, window, gained)
+        return constraint or _cause_without_contact(evidence, report, window, where)
     if concerns := _concerns(evidence, pairs):
         first = concerns[0]
         return Cause("contact setting", f"{where}; {first.words}", f"write {first.change}")
@@ -424,6 +428,43 @@ def _flex_cause(
         return None
     step = evidence.parameters.period / evidence.parameters.substeps
     return Cause("bottomless flex", unstored_words(model, given), storing_flex(model, step))
+
+
+def _constraint_cause(
+    evidence: Evidence, report: AuditReport, window: slice, gained: NDArray[np.float64]
+) -> Cause | None:
+    """Returns a soft equality or limit as the cause, if its work is most of the energy.
+
+    MuJoCo's own constraint is a spring, whose energy no meter knows. Its work in a tick of T is
+    f·(J q̇) T, with the forces f and rows J of a step and the mean q̇ of the speeds around it.
+    """
+    model, parameters = evidence.model, evidence.parameters
+    if model is None or parameters.is_rigid:
+        return None
+    if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
+        return None
+    work, last = defaultdict[str, float](float), np.zeros(model.nv)
+    contact = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+    try:
+        whole = slice(max(window.start - 1, 0), window.stop)
+        for tick, run in enumerate(_runs_in(evidence, whole), whole.start):
+            data = run.data
+            rates = constraint_rows(data) @ (last + data.qvel) / 2.0
+            last = np.array(data.qvel)
+            joules = data.efc_force * rates * parameters.period * (tick >= window.start)
+            for row in np.flatnonzero(data.efc_type < contact).tolist():
+                work[constraint_name(model, data, row)] += float(joules[row])
+    except RecordingError:
+        return None
+    name, given = max(work.items(), key=lambda each: each[1], default=("", 0.0))
+    if given <= MOST * float(gained.sum()):
+        return None
+    return Cause(
+        "constraint",
+        f"{name} did {format_energy(given)} of work until then: with the scene's "
+        "own contacts it is a spring, whose energy no meter knows",
+        "leave out --contact scene: rigid contacts hold it without a spring",
+    )
 
 
 def _cause_without_contact(

@@ -260,7 +260,7 @@ def fidelity(
 
     Args:
         source: The scene; it is not changed.
-        scene: Result of ``compile_scene`` from it; prepared here, and not at its start afterwards.
+        scene: Result of ``compile_scene`` from it; it is not changed.
         setting: Rate, substeps and contact of both, and the coupling of a hand that tries a remedy.
         max_work: Largest work of one motion (``MAX_WORK``), which shortens it.
 
@@ -274,6 +274,7 @@ def fidelity(
         Durlach, Delhorne, Wong, Ko, Rabinowitz & Hollerbach, Perception & Psychophysics 46, 1989:
         1 mm for lengths of 10 to 20 mm between the fingers.
     """
+    scene = scene.for_trial()
     with quiet():
         alone = _FileMotion.simulate(source, scene, max_work)
         return None if alone is None else alone.against(scene, setting)

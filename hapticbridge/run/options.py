@@ -334,7 +334,8 @@ def steady_stiffness(
 
         K = STEADY / (T_s² (1/m_tool + s s_f/m_hand))
 
-    m_tool is the tool's smallest inertia at the grip in kg, m_hand that of hand and device.
+    m_tool is the tool's smallest inertia at the grip in kg, at the scene's start, and m_hand that
+    of hand and device.
 
     Args:
         scene: The loaded scene.
@@ -343,7 +344,9 @@ def steady_stiffness(
         scale: s, handle motion per device motion.
         force_scale: s_f, force on the device per force on the tool.
     """
-    tool = site_inertia(scene.model, scene.data, scene.model.site(scene.grip).id)
+    start = scene.for_trial()
+    start.reset()
+    tool = site_inertia(start.model, start.data, start.model.site(start.grip).id)
     hand = DEFAULT_HAND.mass + (info.mass or 0.0)
     return STEADY / (period * period * (1.0 / tool + scale * force_scale / hand))
 
