@@ -401,12 +401,13 @@ def test_start_beyond_all_numbers_is_named_at_its_keyframe(tmp_path: Path) -> No
     assert (fault.place.file, fault.place.line) == line_of(far, scene)
 
 
-@pytest.mark.parametrize("medium", ["", 'density="1000" viscosity="0.9"'])
+@pytest.mark.parametrize("medium", ["", 'density="1e-9"', 'density="1000" viscosity="0.9"'])
 def test_unmetered_work_is_named_where_it_is_written(medium: str, tmp_path: Path) -> None:
-    """Wind in water moves the tool; no contact or joint created that energy."""
+    """Wind in water moves the tool; wind of a medium without mass gives no force."""
     option = GOOD_OPTION.replace("gravity", f'wind="1 0 0" {medium} gravity')
-    (fault,) = faults_in(tmp_path, mjcf("\n", option, GOOD_CONTACT))
-    assert (fault.kind, fault.place.line) == ("unmetered work", 2)
+    found = faults_in(tmp_path, mjcf("\n", option, GOOD_CONTACT))
+    told = [(fault.kind, fault.place.line) for fault in found]
+    assert told == [("unmetered work", 2)] * bool(medium)
 
 
 @pytest.mark.parametrize("workspace", [0.0, -1.0, np.nan, np.inf])
