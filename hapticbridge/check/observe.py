@@ -23,7 +23,13 @@ from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
 from hapticbridge.run.summary import Ledger
 from hapticbridge.scene import Scene
-from hapticbridge.scene.physics import TendonWatch, WayJump, storing_flex, unstored_words
+from hapticbridge.scene.physics import (
+    TendonWatch,
+    WayJump,
+    jump_behind,
+    storing_flex,
+    unstored_words,
+)
 
 # Clearance of the tool between opposite walls
 
@@ -248,7 +254,8 @@ class Observation:
         warnings: Number of MuJoCo's warnings by text.
         environment: ``strict``, ``within slack`` or ``active``.
         slack_share: Largest share of the slack that was used, without unit.
-        jumps: Largest jump of each tendon that jumped, by id.
+        jump: Tendon whose jumps brought most of the energy created, by id, and its largest jump;
+            None without one.
     """
 
     meetings: dict[tuple[int, int], Meeting]
@@ -260,7 +267,7 @@ class Observation:
     warnings: dict[str, int] = field(default_factory=dict)
     environment: str = "strict"
     slack_share: float = 0.0
-    jumps: dict[int, WayJump] = field(default_factory=dict)
+    jump: tuple[int, WayJump] | None = None
 
 
 def observe(
@@ -286,7 +293,8 @@ def observe(
     types = np.zeros((samples.size, len(_TYPE.__members__)), np.int64)
     postures, every = [], max(samples.size // POSTURES, 1)
     force, full, work, done = np.zeros(samples.size), 0, 0, samples.size
-    jumps, watch = dict[int, WayJump](), TendonWatch(model)
+    jumps, watch = list[dict[int, WayJump]](), TendonWatch(model)
+    created, energy = np.zeros(samples.size + 1), state[0]["energy"]
     for k in range(samples.size):
         if work > MAX_WORK and k >= MIN_TICKS:
             done = k
@@ -302,8 +310,8 @@ def observe(
             types[k, : counted.size] = counted
         if data.ncon:
             _note_contacts(data, model.opt.timestep, meetings, setting.contact == RIGID)
-        for tendon, jump in watch.jumps(data).items():
-            jumps[tendon] = max(jumps.get(tendon, jump), jump)
+        jumps.append(watch.jumps(data))
+        created[k + 1] = energy["environment_energy"]
         iterations = data.solver_niter[: max(data.nisland, 1)]
         full += bool(data.nefc) and bool(iterations.max(initial=0) >= model.opt.iterations)
         force[k] = float(np.linalg.norm(row["wrench_on_tool"][0, :3]))
@@ -312,6 +320,7 @@ def observe(
         if progress is not None and k % PROGRESS_EVERY == 0:
             progress(k, samples.size)
     ledger = Ledger.from_state(state)
+    found = jump_behind(jumps, np.diff(created[: done + 1]).clip(min=0.0))
     return Observation(
         meetings=meetings,
         postures=np.array(postures),
@@ -322,7 +331,7 @@ def observe(
         warnings=_warnings(data),
         environment=ledger.environment,
         slack_share=ledger.slack_share,
-        jumps=jumps,
+        jump=found and (found[0], found[2]),
     )
 
 

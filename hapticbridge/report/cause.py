@@ -33,7 +33,7 @@ from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
 from hapticbridge.scene.physics import (
     STEADY_WAY,
     TendonWatch,
-    WayJump,
+    jump_behind,
     storing_flex,
     unstored_words,
 )
@@ -438,28 +438,24 @@ def _jump_cause(
     A jump of length stretches the tendon's spring, or breaks its limit or constraint, without any
     work. Where its moment arms jump, a step takes the force of one side for that of the other.
     """
-    model, total = evidence.model, float(gained.sum())
-    if model is None or not model.ntendon or total <= 0.0:
+    model = evidence.model
+    if model is None or not model.ntendon:
         return None
     if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
         return None
-    at_jump, largest = np.zeros((model.ntendon, gained.size)), dict[int, WayJump]()
     watch = TendonWatch(model)
     try:
-        for tick, run in enumerate(_runs_in(evidence.recording, window)):
-            for tendon, jump in watch.jumps(run.data).items():
-                at_jump[tendon, max(tick - 1, 0) : tick + 2] = 1.0  # lengths of a step lag by one
-                largest[tendon] = max(largest.get(tendon, jump), jump)
+        jumps = [watch.jumps(run.data) for run in _runs_in(evidence.recording, window)]
     except RecordingError:
         return None
-    shares = at_jump @ gained / total
-    tendon = int(np.argmax(shares))
-    if shares[tendon] < MOST:
+    found = jump_behind(jumps, gained)
+    if found is None:
         return None
-    name, jump = model.tendon(tendon).name or str(tendon), largest[tendon]
+    tendon, share, jump = found
+    name = model.tendon(tendon).name or str(tendon)
     return Cause(
         "jumping tendon",
-        f"{shares[tendon]:.0%} of the energy created until then came as the {jump.quantity} of "
+        f"{share:.0%} of the energy created until then came as the {jump.quantity} of "
         f"tendon '{name}' jumped, by up to {jump.size} in one tick: its way round a geom changed",
         f"write {STEADY_WAY}",
     )
