@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import report_runs
@@ -35,7 +36,13 @@ from hapticbridge.kernel.parameters import DAMPER
 from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.report import write_report
-from hapticbridge.report.cause import Cause, likely_cause, pump_behind_trip
+from hapticbridge.report.cause import (
+    Cause,
+    cause_in_environment,
+    likely_cause,
+    pump_behind_trip,
+    window_before,
+)
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.page import (
     MAX_EVENTS,
@@ -327,7 +334,26 @@ def test_the_scene_is_the_cause_by_what_touched_and_what_was_moved(made: Made) -
     recording, report = made(report_runs.active_by_mocap)
     still = [event for event in recording.events if event["event"] != "input"]
     assert cause_of(recording, report).kind == "inputs"
-    assert cause_of(recording, report, events=still).kind == "contact setting"
+    assert cause_of(recording, report, events=still).kind == "unknown"
+
+
+@pytest.mark.parametrize(
+    # 2π √(m/K): 6.3 ms on 2000 N/m with 2 g, 0.44 s with 10 kg
+    ("mass", "kind", "told"),
+    [(0.002, "contact setting", "2 g swing on 2000 N/m in 6.3 ticks"), (10, "unknown", "")],
+)
+def test_a_tool_is_called_light_by_its_swing_on_the_coupling(
+    mass: float, kind: str, told: str, made: Made
+) -> None:
+    recording, report = made(report_runs.active_by_contact)
+    scene = report_runs.HARD_FLOOR.replace("-20000 -50", "0.002 1").replace("0.1", str(mass))
+    evidence = replace(evidence_of(recording), model=mujoco.MjModel.from_xml_string(scene))
+    foreign = replace(report, agreement=Agreement.NOT_RUN, obstacle="recorded with mujoco 3.0.0")
+    window = window_before(evidence, report)
+    assert window is not None
+    cause = cause_in_environment(evidence, foreign, window)
+    assert (cause.kind, "a light tool" in cause.evidence) == (kind, bool(told))
+    assert told in cause.evidence
 
 
 def test_a_solver_at_its_limit_is_the_cause_of_what_came_in_those_ticks(made: Made) -> None:

@@ -30,11 +30,13 @@ from hapticbridge.recording.reader import BLOCK
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.scene.checks import PUMPING, Pump, may_move, pump_powers, unmetered_work
 from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
+from hapticbridge.scene.fault import weight
 from hapticbridge.scene.physics import (
     STEADY_WAY,
     TendonWatch,
     jump_behind,
     storing_flex,
+    tool_masses,
     unstored_words,
 )
 from hapticbridge.scene.scene import iteration_limit
@@ -335,8 +337,28 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
         return Cause("contact setting", f"{where}; {first.words}", f"write {first.change}")
     if method.hazard:
         return _method_cause(method, "the contacts are set as recommended; ")
-    hard = "a light tool on a stiff coupling is the hard case"
-    return Cause("contact setting", f"{where}; {hard}", _SOFTER)
+    light, usual = _light_tool_words(evidence), "the contacts are set as recommended"
+    return Cause("contact setting" if light else "unknown", f"{where}; {light or usual}", _SOFTER)
+
+
+LIGHT = 20.0
+"""Time of a swing of the tool on the coupling, in ticks, below which the tool counts as light. The
+step follows a faster swing badly, so that contacts are hard for it."""
+
+
+def _light_tool_words(evidence: Evidence) -> str:
+    """Describes a tool that swings fast on its coupling, 2π √(m/K); empty for another one."""
+    model, stiffness = evidence.model, evidence.worst.coupling.stiffness
+    if model is None or stiffness <= 0.0:
+        return ""
+    mass = tool_masses(model, evidence.parameters.grip)[0]
+    ticks = 2.0 * math.pi * math.sqrt(mass / stiffness) / evidence.parameters.period
+    if ticks >= LIGHT:
+        return ""
+    return (
+        f"a light tool on a stiff coupling is the hard case: {weight(mass)} swing on "
+        f"{format_number(stiffness)} N/m in {format_number(ticks, 2)} ticks"
+    )
 
 
 def _cause_of_scene(
@@ -516,8 +538,8 @@ def _cause_without_contact(
         return Cause(
             "rate",
             f"{where}; {what} turned by up to {format_number(turned, 2)} rad a tick "
-            f"({format_number(turned / evidence.parameters.period, 3)} rad/s), and MuJoCo takes "
-            "the gyroscopic torque from the start of a step",
+            f"({format_number(turned / evidence.parameters.period, 3)} rad/s), and MuJoCo "
+            "takes forces of such a motion from the start of a step, which may create it",
             f"raise the rate, or turn {what} slower",
         )
     return Cause(

@@ -313,7 +313,7 @@ class WayJump(NamedTuple):
         return format_si(self.length, "m") if self.length else f"{self.arms:.0%}"
 
 
-JUMPED = 0.5
+JUMP_SHARE = 0.5
 """Share of an energy above which it came by jumps, without unit."""
 
 
@@ -336,7 +336,7 @@ def jump_behind(
         ticks = [tick for tick, each in enumerate(jumps) if tendon in each]
         beside = np.unique(np.add.outer(ticks, (-1, 0, 1)).clip(0, len(jumps) - 1))
         share = float(gained[beside].sum()) / total if total > 0.0 else 0.0
-        if share >= JUMPED and (best is None or share > best[1]):
+        if share >= JUMP_SHARE and (best is None or share > best[1]):
             best = tendon, share, max(jumps[tick][tendon] for tick in ticks)
     return best
 
