@@ -198,7 +198,7 @@ def _timing_cause(evidence: Evidence, window: slice) -> Cause | None:
         return Cause(
             "rate",
             f"ticks late by a period or more in the {format_number(span, 2)} s before: {missed}, "
-            "so that the wrench was held longer than the coupling allows",
+            "in each of which the wrench was held for longer",
             "lower the rate or the load of the machine ('hapticbridge doctor')",
         )
     repeated = float(np.mean((flags & int(TickFlag.STALE_SAMPLE)) != 0))
