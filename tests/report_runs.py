@@ -61,7 +61,7 @@ def circling(tick: int) -> tuple[float, ...]:
     return (0.02 * np.sin(angle), 0.01 * (1 - np.cos(angle)), 0, 1, 0, 0, 0)
 
 
-def _tapping(tick: int) -> tuple[float, ...]:
+def tapping(tick: int) -> tuple[float, ...]:
     return (0, 0, -0.004 * (1 - np.cos(0.04 * tick)), 1, 0, 0, 0)
 
 
@@ -93,7 +93,7 @@ def active_by_method(folder: Path) -> Path:
 
 def active_by_contact(folder: Path) -> Path:
     """A ball pushed onto a floor that is far stiffer than the step resolves."""
-    path, device = folder / "floor.mcap", ScriptedDevice(_tapping)
+    path, device = folder / "floor.mcap", ScriptedDevice(tapping)
     return made_in(path, HARD_FLOOR, device, LOOSE, duration=1.0, contact="scene")
 
 
@@ -132,7 +132,7 @@ def active_by_mocap(folder: Path) -> Path:
 
 def active_beside_a_fan(folder: Path) -> Path:
     """The hard floor again, while a body that touches nothing is moved far away."""
-    path, device = folder / "fan.mcap", ScriptedDevice(_tapping)
+    path, device = folder / "fan.mcap", ScriptedDevice(tapping)
     fan = '<body name="fan" mocap="true" pos="1 0 0"><geom size="0.02"/></body>'
     floor = HARD_FLOOR.replace("<worldbody>", f"<worldbody>{fan}")
     options = {"duration": 0.06, "on_tick": _knock("fan", 1.0), "contact": "scene"}

@@ -329,7 +329,7 @@ def test_a_motor_that_runs_away_is_named_as_the_cause_of_a_trip(
     cause = "pump. actuator 'fan' pushes "
     assert f"likely cause: {cause}" in out
     assert "harder the faster it moves (velocity bias " in out
-    assert "J of work until the trip" in out
+    assert "J of work in the 0.2 s before" in out
     assert "what to change: write a third number of at most 0 in its biasprm" in out
     assert "Likely cause: pump. actuator &#39;fan&#39;" in page.read_text(encoding="utf-8")
     # the sign of the velocity bias alone is at fault

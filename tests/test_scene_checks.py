@@ -161,7 +161,8 @@ def test_options_that_exclude_the_coupling_are_changed_and_told(
 
 def test_what_does_unmetered_work_is_warned_of(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="wind does work"):
-        load_scene(scene_file(tmp_path, mjcf("<option wind='1 0 0'/>")))
+        load_scene(scene_file(tmp_path, mjcf("<option wind='1 0 0' viscosity='0.1'/>")))
+    load_scene(scene_file(tmp_path, mjcf("<option wind='1 0 0'/>")))  # of a medium without mass
     floor = "<geom name='floor' type='plane' size='1 1 1' pos='0 0 -1' adhesion='1'/>"
     with pytest.warns(UserWarning, match="adhesion that pulls across a gap does work"):
         load_scene(scene_file(tmp_path, mjcf(world=floor)))

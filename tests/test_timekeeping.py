@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from audit_cases import AnsweringDevice, ScriptedDevice, SlowClock, recorded, stroke
-from bridge_runs import fast, sway
+from bridge_runs import fast, still, sway
 from cli_cases import Called
 from numpy.typing import NDArray
 
@@ -619,11 +619,16 @@ FLUNG = """
 """A tool of 1 g that a motor of 5 N m turns by up to 0.44 rad within a tick."""
 
 
-@pytest.mark.parametrize("substeps", [1, 5])
-def test_a_flung_tool_is_no_matter_of_time(tmp_path: Path, substeps: int) -> None:
+@pytest.mark.parametrize(("substeps", "delay"), [(1, 0.0), (5, 0.0), (1, 1e-3)])
+def test_a_flung_tool_is_no_matter_of_time_or_of_a_scene_that_creates(
+    tmp_path: Path, substeps: int, delay: float
+) -> None:
     scene, path = tmp_path / "flung.xml", tmp_path / "run.mcap"
     scene.write_text(FLUNG)
-    summary = recorded(path, scene, duration=0.05, substeps=substeps, limits=Limits())
+    late = ScriptedDevice(still, delay=delay, damping=2.0, rotational_damping=2e-3)
+    device = late if delay else "simulated"
+    summary = recorded(path, scene, device, duration=0.05, substeps=substeps, limits=Limits())
+    assert read_recording(path).ticks["environment_energy"].max() < 0.0
     report = audit(path)
     assert report.timekeeping is not None
     kept = summary.timekeeping

@@ -601,7 +601,7 @@ class JudgedDevice:
         except HapticBridgeError as error:  # numbers outside the theory's range
             raise RecordingError(f"the metadata are out of range: {error}") from None
 
-    def judge(self, hand: AuditedHand, timing: TimingTally, energy: HandEnergy) -> None:
+    def judge(self, hand: AuditedHand, timing: TimingTally, energies: PassivityTally) -> None:
         """Judges the device by the run: the time that it kept, and what the hand got."""
         run, recording = hand.run, hand.recording
         times = RunTimes(
@@ -620,8 +620,9 @@ class JudgedDevice:
             silence=timing.silence,
             silent_tick=timing.silent_tick,
             unanswered=run.events.unanswered,
+            has_created=energies.unstrict is not None,
         )
-        account = run.own_loop
+        energy, account = energies.hand_energy, run.own_loop
         certification = certification_of(run.info, run.worst, run.method, times, energy, account)
         self.certification = certification
         if certification.kept.conditions:
@@ -704,7 +705,7 @@ def _compared_in_ticks(
     timings = [TimingTally(hand.run.parameters) for hand in hands]
     fault, duration = _check_records(hands, energies, timings)
     for hand, device, timing, tally in zip(hands, devices, timings, energies, strict=True):
-        device.judge(hand, timing, tally.hand_energy)
+        device.judge(hand, timing, tally)
         if device.certification and (own_loop := device.certification.own_loop):
             tally.excess = tally.excess or own_loop.first_excess
         fault = fault or first_contradiction(event_statements(hand.recording, timing))

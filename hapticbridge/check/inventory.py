@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.observe import Observation, reached_trees
+from hapticbridge.check.observe import Observation
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE
+from hapticbridge.scene.checks import reached_trees
 from hapticbridge.scene.contacts import meeting_pairs
 from hapticbridge.scene.softness import Bounce, bounces
 from hapticbridge.scene.source_map import Place, Places

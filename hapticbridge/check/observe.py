@@ -23,7 +23,13 @@ from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
 from hapticbridge.run.summary import Ledger
 from hapticbridge.scene import Scene
-from hapticbridge.scene.physics import TendonWatch, WayJump, storing_flex, unstored_words
+from hapticbridge.scene.physics import (
+    TendonWatch,
+    WayJump,
+    jump_behind,
+    storing_flex,
+    unstored_words,
+)
 
 # Clearance of the tool between opposite walls
 
@@ -100,64 +106,6 @@ def may_be_near(
     reach = np.where(radius > 0.0, radius, np.inf)  # planes and height fields have no sphere
     apart = np.linalg.norm(data.geom_xpos[first] - data.geom_xpos[second], axis=1)
     return np.asarray(apart <= reach[first] + reach[second] + distance, dtype=bool)
-
-
-# Kinematic trees joined to the tool
-
-
-def reached_trees(model: mujoco.MjModel, tool: int, met: set[tuple[int, int]]) -> set[int]:
-    """Returns the kinematic trees that can influence the tool's tree, including it.
-
-    Contacts, equality constraints and tendons join trees. In a scene with flexes all trees count.
-    ``met`` holds pairs of geom ids.
-    """
-    if model.nflex:  # contacts of a flex are not listed by geom
-        return set(range(model.ntree))
-    tree = model.body_treeid
-    links = [{int(tree[model.geom_bodyid[geom]]) for geom in pair} for pair in met]
-    links += [
-        _trees_of_equality(model, equality)
-        for equality in range(model.neq)
-        if model.eq_active0[equality]
-    ]
-    links += [_trees_of_tendon(model, tendon) for tendon in range(model.ntendon)]
-    links = [link - {-1} for link in links]
-    reached = {tool}
-    while new := {t for link in links if link & reached for t in link} - reached:
-        reached |= new
-    return reached
-
-
-def _trees_of_equality(model: mujoco.MjModel, equality: int) -> set[int]:
-    kind, objects = mujoco.mjtEq, (model.eq_obj1id[equality], model.eq_obj2id[equality])
-    form, tree = int(model.eq_type[equality]), model.body_treeid
-    ids = [int(each) for each in objects if each >= 0]
-    if form == kind.mjEQ_JOINT:
-        return {int(tree[model.jnt_bodyid[each]]) for each in ids}
-    if form == kind.mjEQ_TENDON:
-        return {t for each in ids for t in _trees_of_tendon(model, each)}
-    if form not in (kind.mjEQ_CONNECT, kind.mjEQ_WELD):  # a flex has many bodies
-        return set(range(model.ntree))
-    if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
-        ids = [int(model.site_bodyid[each]) for each in ids]
-    return {int(tree[each]) for each in ids}
-
-
-def _trees_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
-    wrap, tree = mujoco.mjtWrap, model.body_treeid
-    bodies = {
-        wrap.mjWRAP_JOINT: model.jnt_bodyid,
-        wrap.mjWRAP_SITE: model.site_bodyid,
-        wrap.mjWRAP_SPHERE: model.geom_bodyid,
-        wrap.mjWRAP_CYLINDER: model.geom_bodyid,
-    }
-    start = int(model.tendon_adr[tendon])
-    parts = range(start, start + int(model.tendon_num[tendon]))
-    return {
-        int(tree[bodies[kind][model.wrap_objid[part]]])
-        for part in parts
-        if (kind := mujoco.mjtWrap(int(model.wrap_type[part]))) in bodies
-    }
 
 
 # RunPoint of a scene under a motion
@@ -306,7 +254,8 @@ class Observation:
         warnings: Number of MuJoCo's warnings by text.
         environment: ``strict``, ``within slack`` or ``active``.
         slack_share: Largest share of the slack that was used, without unit.
-        jumps: Largest jump of each tendon that jumped, by id.
+        jump: Tendon whose jumps brought most of the energy created, by id, and its largest jump;
+            None without one.
     """
 
     meetings: dict[tuple[int, int], Meeting]
@@ -318,7 +267,7 @@ class Observation:
     warnings: dict[str, int] = field(default_factory=dict)
     environment: str = "strict"
     slack_share: float = 0.0
-    jumps: dict[int, WayJump] = field(default_factory=dict)
+    jump: tuple[int, WayJump] | None = None
 
 
 def observe(
@@ -344,7 +293,8 @@ def observe(
     types = np.zeros((samples.size, len(_TYPE.__members__)), np.int64)
     postures, every = [], max(samples.size // POSTURES, 1)
     force, full, work, done = np.zeros(samples.size), 0, 0, samples.size
-    jumps, watch = dict[int, WayJump](), TendonWatch(model)
+    jumps, watch = list[dict[int, WayJump]](), TendonWatch(model)
+    created, energy = np.zeros(samples.size + 1), state[0]["energy"]
     for k in range(samples.size):
         if work > MAX_WORK and k >= MIN_TICKS:
             done = k
@@ -360,8 +310,8 @@ def observe(
             types[k, : counted.size] = counted
         if data.ncon:
             _note_contacts(data, model.opt.timestep, meetings, setting.contact == RIGID)
-        for tendon, jump in watch.jumps(data).items():
-            jumps[tendon] = max(jumps.get(tendon, jump), jump)
+        jumps.append(watch.jumps(data))
+        created[k + 1] = energy["environment_energy"]
         iterations = data.solver_niter[: max(data.nisland, 1)]
         full += bool(data.nefc) and bool(iterations.max(initial=0) >= model.opt.iterations)
         force[k] = float(np.linalg.norm(row["wrench_on_tool"][0, :3]))
@@ -370,6 +320,7 @@ def observe(
         if progress is not None and k % PROGRESS_EVERY == 0:
             progress(k, samples.size)
     ledger = Ledger.from_state(state)
+    found = jump_behind(jumps, np.diff(created[: done + 1]).clip(min=0.0))
     return Observation(
         meetings=meetings,
         postures=np.array(postures),
@@ -380,7 +331,7 @@ def observe(
         warnings=_warnings(data),
         environment=ledger.environment,
         slack_share=ledger.slack_share,
-        jumps=jumps,
+        jump=found and (found[0], found[2]),
     )
 
 

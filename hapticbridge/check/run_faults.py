@@ -12,7 +12,7 @@ from hapticbridge.check.observe import Observation
 from hapticbridge.scene.checks import unmetered_work
 from hapticbridge.scene.contacts import suggested_solref
 from hapticbridge.scene.fault import Fault, number
-from hapticbridge.scene.physics import STEADY_WAY
+from hapticbridge.scene.physics import STEADY_WAY, WayJump
 from hapticbridge.scene.scene import iteration_limit
 from hapticbridge.units import format_count
 
@@ -100,8 +100,8 @@ def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:
             f"{number(100 * seen.slack_share)} % of the coupling's slack, which covers it",
         )
     )
-    if seen.jumps:
-        return _created_by_jump(case, seen, kind, used)
+    if seen.jump is not None:
+        return _created_by_jump(case, *seen.jump, kind, used)
     sentence = (
         f"contacts or joints created energy in the motion: {used}; a hand that yields, as in a "
         "run, may see less"
@@ -119,10 +119,11 @@ def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:
     )
 
 
-def _created_by_jump(case: SceneUnderCheck, seen: Observation, kind: str, used: str) -> Fault:
-    """Names the tendon with the largest jump: what stretches it at once does no work for that."""
-    tendon = max(seen.jumps, key=lambda each: seen.jumps[each])
-    place, jump = case.places.find("tendon", tendon), seen.jumps[tendon]
+def _created_by_jump(
+    case: SceneUnderCheck, tendon: int, jump: WayJump, kind: str, used: str
+) -> Fault:
+    """Names the tendon that jumped: what stretches it at once does no work for that."""
+    place = case.places.find("tendon", tendon)
     return Fault(
         kind,
         place,

@@ -41,7 +41,8 @@ from hapticbridge.units import format_number, format_si
 NOT_KEPT = "the run did not keep its time"
 SCENE_BEHIND = "behind the device's delay the scene created energy"
 TOO_FAR = "the scene moved or turned the tool too far within a tick"
-"""Words that name the fault of a run; the last where all was in time and no delay is stated."""
+"""Words that name the fault of a run; the last where all was in time and no delay
+hides what the scene creates."""
 
 _SHAKEN = "the hand jerked it, or shook it faster than 8 Hz"
 
@@ -74,6 +75,7 @@ class RunTimes:
         silence: Longest time in s without a new sample of the device.
         silent_tick: Last tick of that time.
         unanswered: Axes of which the probe could not tell the direction, by name.
+        has_created: True if the scene ever gave out more energy than it got.
     """
 
     ticks: int
@@ -91,6 +93,7 @@ class RunTimes:
     silence: float = 0.0
     silent_tick: int = 0
     unanswered: str = ""
+    has_created: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,6 +201,7 @@ class Timekeeping:
         due_rate: New samples per second that were due: those that the device states, or that the
             loop reads if that is less.
         is_rate_stated: True if they are those that the device states.
+        has_created: True if the scene ever gave out more energy than it got.
     """
 
     rate: float
@@ -219,6 +223,7 @@ class Timekeeping:
     sample_rate: float
     due_rate: float
     is_rate_stated: bool
+    has_created: bool
 
     @classmethod
     def from_times(
@@ -266,6 +271,7 @@ class Timekeeping:
             sample_rate=sample_rate,
             due_rate=min(rate, stated),
             is_rate_stated=stated <= rate * (1.0 + ROUNDING),
+            has_created=times.has_created,
         )
 
     @property
@@ -316,7 +322,12 @@ class Timekeeping:
         """Clause on what refutes the certificate of a device that bears the coupling in time."""
         if self.silence or not self._is_timely:
             return NOT_KEPT
-        return SCENE_BEHIND if any(each.delay for each in self.in_time) else TOO_FAR
+        return SCENE_BEHIND if self._has_created_behind else TOO_FAR
+
+    @property
+    def _has_created_behind(self) -> bool:
+        """True if the scene created energy, and a delay lets no slack pay for it."""
+        return self.has_created and any(each.delay for each in self.in_time)
 
     @property
     def _late(self) -> str:
@@ -397,9 +408,8 @@ class Timekeeping:
                 f"{usual.available:.3g}"
             )
         else:
-            is_behind = any(each.delay for each in self.in_time)
             givers = "late samples and forces, or a tool that moved or turned far within a tick,"
-            givers += " and the scene behind the delay," * is_behind
+            givers += " and the scene behind the delay," * self._has_created_behind
             reason = f"{givers} may have given the hand {given}"
         if self.silence and self.share >= MANY_KEPT and not self.sample_rate:
             return f"{NOT_KEPT}: {self.silence.sentence}; check its link and its power ({reason})"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Literal
+from functools import partial
+from typing import Literal, TypeVar
 
 import mujoco
 import numpy as np
@@ -27,14 +28,16 @@ from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.scene.checks import first_pump, unmetered_work
+from hapticbridge.scene.checks import PUMPING, Pump, may_move, pump_powers, unmetered_work
 from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
+from hapticbridge.scene.fault import weight
 from hapticbridge.scene.handle import constraint_rows
 from hapticbridge.scene.physics import (
     STEADY_WAY,
     TendonWatch,
-    WayJump,
+    jump_behind,
     storing_flex,
+    tool_masses,
     unstored_words,
 )
 from hapticbridge.scene.scene import iteration_limit
@@ -198,7 +201,7 @@ def _timing_cause(evidence: Evidence, window: slice) -> Cause | None:
         return Cause(
             "rate",
             f"ticks late by a period or more in the {format_number(span, 2)} s before: {missed}, "
-            "so that the wrench was held longer than the coupling allows",
+            "in each of which the wrench was held for longer",
             "lower the rate or the load of the machine ('hapticbridge doctor')",
         )
     repeated = float(np.mean((flags & int(TickFlag.STALE_SAMPLE)) != 0))
@@ -270,7 +273,7 @@ def touched_pairs(
     total = float(gained.sum())
     found: defaultdict[frozenset[int], float] = defaultdict(float)
     try:
-        for run, energy in zip(_runs_in(evidence, window), gained.tolist(), strict=True):
+        for run, energy in zip(_runs_in(evidence.recording, window), gained.tolist(), strict=True):
             contact = run.data.contact
             touching = contact.geom[contact.efc_address >= 0].tolist()
             for pair in {frozenset(geoms) for geoms in touching}:
@@ -280,14 +283,14 @@ def touched_pairs(
     return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 
-def _runs_in(evidence: Evidence, window: slice) -> Iterator[Resimulator]:
+def _runs_in(recording: Recording, window: slice) -> Iterator[Resimulator]:
     """Simulates a run again; yields it after each tick of the window.
 
     Raises:
         RecordingError: It cannot be simulated.
     """
-    ticks = evidence.ticks
-    run = Resimulator(evidence.recording, AuditedRun.of(evidence.recording).parameters)
+    ticks = recording.ticks
+    run = Resimulator(recording, AuditedRun.of(recording).parameters)
     for begin in range(0, window.start, BLOCK):
         run.add(ticks[begin : min(begin + BLOCK, window.start)])
     for tick in range(window.start, window.stop):
@@ -316,13 +319,16 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
     if pairs:
         where += _pair_words(evidence, pairs)
     if (moved := _moved_bodies(evidence, window)) and _can_push(evidence, pairs, share):
-        return Cause(
-            "inputs",
-            f"mocap bodies were moved {moved} times in the {WINDOW:g} s before; {where}; MuJoCo "
-            "damps their contacts and welds against rest, so a fast move creates energy",
-            "move them slower",
-        )
-    own = _cause_of_scene(evidence, report, where)
+        work = _input_work(evidence, window)
+        if work > MOST * float(gained.sum()):
+            return Cause(
+                "inputs",
+                f"mocap bodies were moved {moved} times in the {WINDOW:g} s before, and inputs "
+                f"gave and took {format_energy(work)}; {where}; MuJoCo damps their contacts and "
+                "welds against rest, so a fast move creates energy",
+                "move them slower",
+            )
+    own = _cause_of_scene(evidence, report, window, gained, where)
     own = own or _solver_cause(evidence, window, gained)
     own = own or _flex_cause(evidence, report, window, gained)
     if cause := own or _jump_cause(evidence, report, window, gained):
@@ -335,24 +341,119 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
         return Cause("contact setting", f"{where}; {first.words}", f"write {first.change}")
     if method.hazard:
         return _method_cause(method, "the contacts are set as recommended; ")
-    hard = "a light tool on a stiff coupling is the hard case"
-    return Cause("contact setting", f"{where}; {hard}", _SOFTER)
+    light, usual = _light_tool_words(evidence), "the contacts are set as recommended"
+    return Cause("contact setting" if light else "unknown", f"{where}; {light or usual}", _SOFTER)
 
 
-def _cause_of_scene(evidence: Evidence, report: AuditReport, where: str) -> Cause | None:
-    """Returns what the scene itself does beside any contact: a pump, or work without a port."""
-    model = evidence.model
-    if model is None:
+LIGHT = 20.0
+"""Time of a swing of the tool on the coupling, in ticks, below which the tool counts as light. The
+step follows a faster swing badly, so that contacts are hard for it."""
+
+
+def _light_tool_words(evidence: Evidence) -> str:
+    """Describes a tool that swings fast on its coupling, 2π √(m/K); empty for another one."""
+    model, stiffness = evidence.model, evidence.worst.coupling.stiffness
+    if model is None or stiffness <= 0.0:
+        return ""
+    mass = tool_masses(model, evidence.parameters.grip)[0]
+    ticks = 2.0 * math.pi * math.sqrt(mass / stiffness) / evidence.parameters.period
+    if ticks >= LIGHT:
+        return ""
+    return (
+        f"a light tool on a stiff coupling is the hard case: {weight(mass)} swing on "
+        f"{format_number(stiffness)} N/m in {format_number(ticks, 2)} ticks"
+    )
+
+
+def _cause_of_scene(
+    evidence: Evidence,
+    report: AuditReport,
+    window: slice,
+    gained: NDArray[np.float64],
+    where: str,
+) -> Cause | None:
+    """Returns what the scene itself does beside any contact, if its work is most of the energy.
+
+    This is a pump, or work without a port.
+    """
+    model, least = evidence.model, MOST * float(gained.sum())
+    if model is None or report.agreement not in (Agreement.EXACT, Agreement.NEAR):
         return None
-    pump = first_pump(model)
+    pump, work = _hardest_pump(evidence.recording, model, window)
     # a motor's work is no creation, until its motion is beyond all measure
-    if pump is not None and (pump.kind == "joint" or report.trip is not None):
-        return Cause("pump", f"{pump.words}; {where}", f"write {pump.change}")
-    found = [
-        Cause("unmetered work", f"{clause}; {where}", f"remove {name}, or make it weaker")
-        for name, clause in unmetered_work(model).items()
-    ]
-    return found[0] if found else None
+    is_creation = pump is not None and (pump.kind == "joint" or report.trip is not None)
+    if pump is not None and is_creation and work > least:
+        return _pump_cause(pump, work, where)
+    clauses = unmetered_work(model)
+    powers = partial(_unmetered_powers, clauses)
+    works = _works(evidence.recording, model, window, powers)
+    name = max(works, key=lambda each: works[each], default="")
+    if not name or works[name] <= least:
+        return None
+    did = f"{clauses[name]}: {format_energy(works[name])} in the {WINDOW:g} s before"
+    return Cause("unmetered work", f"{did}; {where}", f"remove {name}, or make it weaker")
+
+
+def _pump_cause(pump: Pump, work: float, where: str) -> Cause:
+    did = f"it did {format_energy(work)} of work in the {WINDOW:g} s before"
+    return Cause("pump", f"{pump.words}; {did}; {where}", f"write {pump.change}")
+
+
+def _hardest_pump(
+    recording: Recording, model: mujoco.MjModel, window: slice, grips: Sequence[str] = ()
+) -> tuple[Pump | None, float]:
+    """Returns the pump that did most work in a window, and this work in J.
+
+    Only those count that might move the tools of ``grips`` then; all of them if it is empty.
+    """
+    powers = pump_powers(model)
+
+    def given(data: mujoco.MjData) -> dict[Pump, float]:
+        met = data.contact.geom.tolist()
+        joined = {pump: may_move(pump, data, grips, met) for pump in powers(data)}
+        return {pump: power * joined[pump] for pump, power in powers(data).items()}
+
+    works = _works(recording, model, window, given)
+    pump = max(works, key=lambda each: works[each], default=None)
+    return pump, 0.0 if pump is None else works[pump]
+
+
+def _unmetered_powers(names: Iterable[str], data: mujoco.MjData) -> dict[str, float]:
+    """Returns the powers in W of what no port meters, by the names of ``unmetered_work``."""
+    told = data.qfrc_spring + data.qfrc_damper + data.qfrc_gravcomp
+    told += data.qfrc_fluid + data.qfrc_adhesion
+    forces = {
+        "wind": data.qfrc_fluid,
+        "adhesion": data.qfrc_adhesion,
+        "plugin": data.qfrc_passive - told,
+    }
+    return {name: float(forces[name] @ data.qvel) for name in names}
+
+
+Part = TypeVar("Part")
+
+
+def _works(
+    recording: Recording,
+    model: mujoco.MjModel,
+    window: slice,
+    powers: Callable[[mujoco.MjData], dict[Part, float]],
+) -> dict[Part, float]:
+    """Returns the work in J of each part of the scene in a window, by its power in each tick.
+
+    It is empty if there is no such part, or the run cannot be simulated again.
+    """
+    works = defaultdict[Part, float](float)
+    if not powers(mujoco.MjData(model)):
+        return {}
+    try:
+        period = AuditedRun.of(recording).parameters.period
+        for run in _runs_in(recording, window):
+            for part, power in powers(run.data).items():
+                works[part] += period * power
+    except RecordingError:
+        return {}
+    return works
 
 
 def _jump_cause(
@@ -363,28 +464,24 @@ def _jump_cause(
     A jump of length stretches the tendon's spring, or breaks its limit or constraint, without any
     work. Where its moment arms jump, a step takes the force of one side for that of the other.
     """
-    model, total = evidence.model, float(gained.sum())
-    if model is None or not model.ntendon or total <= 0.0:
+    model = evidence.model
+    if model is None or not model.ntendon:
         return None
     if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
         return None
-    at_jump, largest = np.zeros((model.ntendon, gained.size)), dict[int, WayJump]()
     watch = TendonWatch(model)
     try:
-        for tick, run in enumerate(_runs_in(evidence, window)):
-            for tendon, jump in watch.jumps(run.data).items():
-                at_jump[tendon, max(tick - 1, 0) : tick + 2] = 1.0  # lengths of a step lag by one
-                largest[tendon] = max(largest.get(tendon, jump), jump)
+        jumps = [watch.jumps(run.data) for run in _runs_in(evidence.recording, window)]
     except RecordingError:
         return None
-    shares = at_jump @ gained / total
-    tendon = int(np.argmax(shares))
-    if shares[tendon] < MOST:
+    found = jump_behind(jumps, gained)
+    if found is None:
         return None
-    name, jump = model.tendon(tendon).name or str(tendon), largest[tendon]
+    tendon, share, jump = found
+    name = model.tendon(tendon).name or str(tendon)
     return Cause(
         "jumping tendon",
-        f"{shares[tendon]:.0%} of the energy created until then came as the {jump.quantity} of "
+        f"{share:.0%} of the energy created until then came as the {jump.quantity} of "
         f"tendon '{name}' jumped, by up to {jump.size} in one tick: its way round a geom changed",
         f"write {STEADY_WAY}",
     )
@@ -420,7 +517,9 @@ def _flex_cause(
         return None
     try:
         whole = slice(max(window.start - 1, 0), window.stop)
-        sums = [unstored_energy(run.binding.state[0]) for run in _runs_in(evidence, whole)]
+        sums = [
+            unstored_energy(run.binding.state[0]) for run in _runs_in(evidence.recording, whole)
+        ]
     except RecordingError:
         return None
     given = sums[-1] - (sums[0] if window.start else 0.0)
@@ -480,8 +579,8 @@ def _cause_without_contact(
         return Cause(
             "rate",
             f"{where}; {what} turned by up to {format_number(turned, 2)} rad a tick "
-            f"({format_number(turned / evidence.parameters.period, 3)} rad/s), and MuJoCo takes "
-            "the gyroscopic torque from the start of a step",
+            f"({format_number(turned / evidence.parameters.period, 3)} rad/s), and MuJoCo "
+            "takes forces of such a motion from the start of a step, which may create it",
             f"raise the rate, or turn {what} slower",
         )
     return Cause(
@@ -508,7 +607,9 @@ def _faster_body(
     if model is None or report.agreement not in (Agreement.EXACT, Agreement.NEAR):
         return None
     try:
-        speeds = [np.linalg.norm(r.data.cvel[:, :3], axis=1) for r in _runs_in(evidence, window)]
+        speeds = [
+            np.linalg.norm(r.data.cvel[:, :3], axis=1) for r in _runs_in(evidence.recording, window)
+        ]
     except RecordingError:
         return None
     largest = np.nan_to_num(np.max(speeds, axis=0)) * evidence.parameters.period
@@ -558,6 +659,15 @@ def _moved_bodies(evidence: Evidence, window: slice) -> int:
         in str(event.get("writes"))  # as text, because a damaged event may have any shape
         for event in evidence.events
     )
+
+
+def _input_work(evidence: Evidence, window: slice) -> float:
+    """Returns the energy in J that the scene's inputs gave and took in a window, both as one sum.
+
+    The energy that a moved body creates is an error of this work.
+    """
+    work = evidence.ticks["external_work"]
+    return float(np.abs(np.diff(work, prepend=0.0))[window].sum())
 
 
 # Search for the likely cause
@@ -630,7 +740,7 @@ def likely_cause(
 def pump_behind_trip(
     recording: Recording, report: AuditReport, *, in_process: bool = False
 ) -> Cause | None:
-    """Returns a part of the scene that pumps as the likely cause of a trip; None without one.
+    """Returns a part of the scene that pumped before a trip as its likely cause; None without one.
 
     An active run has a cause of its own (``likely_cause``). A run of several hands has none, nor a
     trip for a fault of the device. ``in_process`` is as for ``likely_cause``.
@@ -638,15 +748,17 @@ def pump_behind_trip(
     trip = None if report.verdict == "active" else report.trip
     if trip is None or not trip.may_be_pumped or recording.hands > 1:
         return None
-    work = format_energy(report.energies.get("actuator_work", 0.0))
+    if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
+        return None
+    parameters, end = AuditedRun.of(recording).parameters, recording.count
+    window = slice(max(0, end - round(WINDOW / parameters.period)), end)
+    grips = () if trip.is_unsound else (parameters.grip,)
 
     def found(model: mujoco.MjModel) -> Cause | None:
-        pump = first_pump(model)
-        if pump is None:
+        pump, work = _hardest_pump(recording, model, window, grips)
+        if pump is None or work <= PUMPING * WINDOW:
             return None
-        words = f"; the scene's motors did {work} of work until the trip"
-        evidence = pump.words + (words if pump.kind == "actuator" else "")
-        return Cause("pump", evidence, f"write {pump.change}")
+        return _pump_cause(pump, work, trip.words)
 
     try:
         return _cause_in_scene(recording, found, in_process)

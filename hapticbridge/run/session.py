@@ -80,7 +80,7 @@ from hapticbridge.run.slow_scene import SlowScene
 from hapticbridge.run.summary import RunOutcome, Summary, hand_energy
 from hapticbridge.run.unpacked import warn_of_other_scene
 from hapticbridge.scene import Scene
-from hapticbridge.scene.checks import first_pump, strongest_actuator
+from hapticbridge.scene.checks import strongest_actuator, working_pump
 from hapticbridge.scene.inputs import Write
 from hapticbridge.signals import deferring_stops
 
@@ -763,7 +763,9 @@ class Session:
         energies = (hand_energy(self.kernel.state[i : i + 1], own) for i, own in hands)
         energy = max(energies, key=lambda each: each.net)
         model, data = self.setup.scene.model, self.setup.scene.data
-        pump = first_pump(model) if cause.may_be_pumped else None
+        scene = self.setup.scene
+        grips = () if cause.is_unsound else (scene.grip, *scene.other_grips)
+        pump = working_pump(data, grips) if cause.may_be_pumped else None
         if pump is not None:
             trip.add_note(f"{pump.words}; write {pump.change}")
         elif remedy := cause.remedy(energy, created, strongest_actuator(model, data)):

@@ -572,6 +572,7 @@ class Summary:
             silence=float(state["guard"]["longest_silence"][0]),
             silent_tick=int(state["guard"]["silent_tick"][0]),
             unanswered=outcome.probed.axes(Direction.UNKNOWN) if outcome.probed else "",
+            has_created=ledger.first_unstrict is not None,
         )
         peaks: dict[str, Any] = {name: float(state["loop"][name][0]) for name in _PEAKS}
         hand = HandEnergy() if info.is_prescribed else hand_energy(state, parameters)

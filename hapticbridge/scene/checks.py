@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import codecs
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -177,9 +177,73 @@ def _pushes(model: mujoco.MjModel, data: mujoco.MjData, actuator: int) -> tuple[
 
 def first_pump(model: mujoco.MjModel) -> Pump | None:
     """Returns the first joint or actuator that pushes what moves already; None without one."""
+    return next(iter(_pumps_at_start(model)), None)
+
+
+def _pumps_at_start(model: mujoco.MjModel) -> list[Pump]:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    return next(iter(pumps(model, data)), None)
+    return pumps(model, data)
+
+
+PUMPING = 5e-3
+"""Power in W above which a pump is at work: 1 mJ in 0.2 s, which no hand feels. A pump that rests
+gives none."""
+
+
+def pump_powers(model: mujoco.MjModel) -> Callable[[mujoco.MjData], dict[Pump, float]]:
+    """Returns a function of a scene's state, for the power in W of each pump."""
+    found = _pumps_at_start(model)
+    return lambda data: {pump: _power_of(pump, data) for pump in found}
+
+
+def working_pump(data: mujoco.MjData, grips: Sequence[str]) -> Pump | None:
+    """Returns the pump with the largest power at a state; None if none is at work.
+
+    Only those count that may move the tools of ``grips``; all of them if it is empty.
+    """
+    met = data.contact.geom.tolist()
+    powers = {
+        pump: power
+        for pump, power in pump_powers(data.model)(data).items()
+        if may_move(pump, data, grips, met)
+    }
+    pump = max(powers, key=lambda each: powers[each], default=None)
+    return None if pump is None or powers[pump] <= PUMPING else pump
+
+
+def may_move(
+    pump: Pump, data: mujoco.MjData, grips: Sequence[str], met: Iterable[Iterable[int]]
+) -> bool:
+    """Returns True if a pump's bodies are joined to the tool of a grip, or if there is no grip.
+
+    ``met`` holds pairs of ids of geoms that touched.
+    """
+    model = data.model
+    if pump.kind == "joint":
+        dofs = np.flatnonzero(model.dof_jntid == pump.number)
+    else:
+        output = int(model.actuator_outadr[pump.number])
+        first = int(data.moment_rowadr[output])
+        dofs = data.moment_colind.ravel()[first : first + int(data.moment_rownnz[output])]
+    own, pairs = set(model.dof_treeid[dofs].tolist()), [*map(set, met)]
+    tools = (int(model.body_treeid[held_body(model, grip)]) for grip in grips)
+    return not grips or any(own & reached_trees(model, tool, pairs) for tool in tools)
+
+
+def _power_of(pump: Pump, data: mujoco.MjData) -> float:
+    """Returns the power in W that a pump gives to what moves; inf at a motion beyond all numbers.
+
+    A joint gives −d v² along its axes, an actuator its force times its velocity.
+    """
+    model = data.model
+    if pump.kind == "joint":
+        dofs = model.dof_jntid == pump.number
+        power = -float(model.dof_damping[dofs] @ np.square(data.qvel[dofs]))
+    else:
+        output = int(model.actuator_outadr[pump.number])
+        power = float(data.actuator_force[output] * data.actuator_velocity[output])
+    return power if math.isfinite(power) else math.inf
 
 
 def strongest_actuator(model: mujoco.MjModel, data: mujoco.MjData) -> str:
@@ -245,6 +309,64 @@ OF_A_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPAR
 """Transmissions of an actuator that acts on a joint."""
 
 
+# Kinematic trees joined to the tool
+
+
+def reached_trees(model: mujoco.MjModel, tool: int, met: Iterable[Iterable[int]]) -> set[int]:
+    """Returns the kinematic trees that can influence the tool's tree, including it.
+
+    Contacts, equality constraints and tendons join trees. In a scene with flexes all trees count.
+    ``met`` holds pairs of geom ids.
+    """
+    if model.nflex:  # contacts of a flex are not listed by geom
+        return set(range(model.ntree))
+    tree = model.body_treeid
+    links = [{int(tree[model.geom_bodyid[geom]]) for geom in pair} for pair in met]
+    links += [
+        _trees_of_equality(model, equality)
+        for equality in range(model.neq)
+        if model.eq_active0[equality]
+    ]
+    links += [_trees_of_tendon(model, tendon) for tendon in range(model.ntendon)]
+    links = [link - {-1} for link in links]
+    reached = {tool}
+    while new := {t for link in links if link & reached for t in link} - reached:
+        reached |= new
+    return reached
+
+
+def _trees_of_equality(model: mujoco.MjModel, equality: int) -> set[int]:
+    kind, objects = mujoco.mjtEq, (model.eq_obj1id[equality], model.eq_obj2id[equality])
+    form, tree = int(model.eq_type[equality]), model.body_treeid
+    ids = [int(each) for each in objects if each >= 0]
+    if form == kind.mjEQ_JOINT:
+        return {int(tree[model.jnt_bodyid[each]]) for each in ids}
+    if form == kind.mjEQ_TENDON:
+        return {t for each in ids for t in _trees_of_tendon(model, each)}
+    if form not in (kind.mjEQ_CONNECT, kind.mjEQ_WELD):  # a flex has many bodies
+        return set(range(model.ntree))
+    if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
+        ids = [int(model.site_bodyid[each]) for each in ids]
+    return {int(tree[each]) for each in ids}
+
+
+def _trees_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
+    wrap, tree = mujoco.mjtWrap, model.body_treeid
+    bodies = {
+        wrap.mjWRAP_JOINT: model.jnt_bodyid,
+        wrap.mjWRAP_SITE: model.site_bodyid,
+        wrap.mjWRAP_SPHERE: model.geom_bodyid,
+        wrap.mjWRAP_CYLINDER: model.geom_bodyid,
+    }
+    start = int(model.tendon_adr[tendon])
+    parts = range(start, start + int(model.tendon_num[tendon]))
+    return {
+        int(tree[bodies[kind][model.wrap_objid[part]]])
+        for part in parts
+        if (kind := mujoco.mjtWrap(int(model.wrap_type[part]))) in bodies
+    }
+
+
 MAXIMUM_START_PENETRATION = 1e-4
 """Largest penetration of the tool at the start, in m, for contacts of the scene. Their penetration
 releases energy that no port meters: 26 mJ within 15 ms were measured. A larger value allows a
@@ -305,7 +427,7 @@ def unmetered_work(model: mujoco.MjModel) -> dict[str, str]:
         A clause for each attribute or element that does it, by its name.
     """
     found = dict[str, str]()
-    if np.any(model.opt.wind):
+    if np.any(model.opt.wind) and max(model.opt.density, model.opt.viscosity) > 0.0:
         found["wind"] = "wind does work on the scene that no port meters"
     if np.any(model.geom_adhesion) or np.any(model.pair_adhesion):
         found["adhesion"] = (

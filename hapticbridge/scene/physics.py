@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -311,6 +311,34 @@ class WayJump(NamedTuple):
     def size(self) -> str:
         """Size of the jump, with its unit."""
         return format_si(self.length, "m") if self.length else f"{self.arms:.0%}"
+
+
+JUMP_SHARE = 0.5
+"""Share of an energy above which it came by jumps, without unit."""
+
+
+def jump_behind(
+    jumps: Sequence[Mapping[int, WayJump]], gained: Array
+) -> tuple[int, float, WayJump] | None:
+    """Returns the tendon whose jumps brought most of an energy; None if none did.
+
+    Lengths of a step lag by one, so that the ticks beside a jump count, too.
+
+    Args:
+        jumps: Tendons that jumped in each tick, (n,).
+        gained: Energy in J that was created in each tick, (n,), each >= 0.
+
+    Returns:
+        Its id, the share of the energy without unit, and its largest jump.
+    """
+    total, best = float(gained.sum()), None
+    for tendon in set().union(*jumps):
+        ticks = [tick for tick, each in enumerate(jumps) if tendon in each]
+        beside = np.unique(np.add.outer(ticks, (-1, 0, 1)).clip(0, len(jumps) - 1))
+        share = float(gained[beside].sum()) / total if total > 0.0 else 0.0
+        if share >= JUMP_SHARE and (best is None or share > best[1]):
+            best = tendon, share, max(jumps[tick][tendon] for tick in ticks)
+    return best
 
 
 class _Ways(NamedTuple):
