@@ -39,6 +39,18 @@ def test_run_prints_the_summary_as_json(call: Called, tmp_path: Path) -> None:
     assert summary["recording"] == str(path)
 
 
+def test_json_of_a_run_has_what_was_told_of_its_scene(call: Called, tmp_path: Path) -> None:
+    """A program that reads the summary learns of changes and faults as a reader of the text."""
+    path = tmp_path / "arm.xml"
+    path.write_text(FELT_WRONG.format(turn='range="-0.78 0.78"', reach=0.15, width=0.01))
+    command = ("run", path, "--fast", "--duration", 0.01)
+    told = call(*command)[2]
+    summary = json.loads(call(*command, "--json")[1])
+    assert [line for line in summary["scene_changes"] if line not in told] == []
+    assert len(summary["scene_changes"]) == told.count("changed in the scene: ") > 1
+    assert len(summary["scene_findings"]) == told.count("warning: joint 'turn'") == 1
+
+
 FELT_WRONG = """<mujoco>
   <compiler angle="degree"/>
   <worldbody>

@@ -30,6 +30,7 @@ from hapticbridge.run.options import BridgeOptions, RunSetup, Workspace
 from hapticbridge.scene import Scene, SceneSource, compile_scene
 from hapticbridge.scene.fault import CompiledScene
 from hapticbridge.scene.source_map import Places
+from hapticbridge.scene.treatment import SceneChange
 
 # Motion for a check: the scene's own hand path, a file of poses, or a recording
 
@@ -115,6 +116,7 @@ class SceneUnderCheck(CompiledScene):
         motion_fault: Reason why the motion did not finish.
         contact: Contact of the run that the scene is checked for: ``rigid``, the default of a run,
             or ``scene``, MuJoCo's own.
+        differences: Differences of the run from the file, those by its contacts too.
     """
 
     info: DeviceInfo
@@ -130,6 +132,7 @@ class SceneUnderCheck(CompiledScene):
     observation: Observation | None = None
     motion_fault: str = ""
     contact: Literal["rigid", "scene"] = "rigid"
+    differences: tuple[SceneChange, ...] = ()
 
     @property
     def is_rigid(self) -> bool:
@@ -234,6 +237,8 @@ def open_case(
     except (SceneError, mujoco.FatalError) as error:
         fault = " ".join(str(error).split())
     finally:
+        scene.set_contact(is_rigid=use.contact == RIGID)
+        differences = scene.differences
         scene.set_contact(is_rigid=False)  # the file's own settings are what the rules examine
     return SceneUnderCheck(
         source=source,
@@ -252,6 +257,7 @@ def open_case(
         observation=observation,
         motion_fault=fault,
         contact=use.contact,
+        differences=differences,
     )
 
 

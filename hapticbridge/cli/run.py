@@ -387,10 +387,11 @@ def refuse_overwriting(record: Path | None, *devices: str, overwrite: bool) -> N
             raise RecordingError(f"'{motion}' is the motion of the run; choose another file")
 
 
-def print_summary(summary: Summary, record: Path | None, *, as_json: bool) -> None:
-    """Prints what a run has come to, for a reader or as JSON with the recording's name."""
+def print_summary(summary: Summary, scene: Scene, record: Path | None, *, as_json: bool) -> None:
+    """Prints a run's summary, for a reader or as JSON with what was told of its scene before."""
     if as_json:
-        print_json(summary.to_dict() | {"recording": str(record or "") or None})
+        told = {"scene_changes": scene.changes, "scene_findings": scene.findings}
+        print_json(summary.to_dict() | {"recording": str(record or "") or None} | told)
         return
     for line in str(summary).splitlines():
         out.print(plain(line))
@@ -710,16 +711,16 @@ class Run:
             summary = bridge.run(self._duration(bridge.device.info))
         except SafetyTrip:
             stack.close()
-            self._print(bridge.summary())
+            self._print(bridge.summary(), bridge.scene)
             raise
         stack.close()
         if not summary.ticks and (name := bridge.session.signal):
             raise StopSignal(Signals[name])
-        self._print(summary)
+        self._print(summary, bridge.scene)
         return exit_code(summary)
 
-    def _print(self, summary: Summary) -> None:
-        print_summary(summary, self.record, as_json=self.as_json)
+    def _print(self, summary: Summary, scene: Scene) -> None:
+        print_summary(summary, scene, self.record, as_json=self.as_json)
         if not self.as_json and self._is_viewed and self.record is not None:
             notify(f"the page ends with the run; 'hapticbridge view {self.record}' plays it")
 

@@ -156,7 +156,8 @@ class Serve:
             finally:
                 endpoint.close(error)
                 stack.close()
-                print_summary(summary := bridge.summary(), self.record, as_json=self.as_json)
+                summary = bridge.summary()
+                print_summary(summary, bridge.scene, self.record, as_json=self.as_json)
         return exit_code(summary)
 
     def _on_leave(self, bridge: Bridge, clock: RealClock | GrantedClock) -> Callable[[str], None]:
