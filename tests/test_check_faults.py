@@ -29,6 +29,7 @@ from check_scenes import (
 )
 from outside_scenes import hand_rows, mjcf
 
+import hapticbridge as hb
 from hapticbridge.check import lean
 from hapticbridge.check.case import IntendedUse, open_case, samples_of
 from hapticbridge.check.contact_faults import shape_faults
@@ -967,6 +968,22 @@ def test_check_tells_what_the_contacts_of_a_run_change_as_the_run_does(
     assert all(one.is_note and "--contact scene" in one.change for one in changed)
     kept = [one for one in faults_in(tmp_path, text, contact="scene") if one.kind == "changed"]
     assert not kept
+
+
+HANGS = """<mujoco><option timestep="0.001" integrator="discrete" cone="elliptic"/><worldbody>
+<body><freejoint/><geom size=".02" mass="{mass}"/><site name="grip"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(("mass", "is_carried"), [(1.0, False), (1.1, True)])
+def test_check_tells_that_a_run_carries_a_tool_in_its_words(
+    tmp_path: Path, mass: float, is_carried: bool
+) -> None:
+    """The simulated device holds 10 N, and 1.1 kg weigh 10.8 N."""
+    text = HANGS.format(mass=mass)
+    changed = [one.sentence for one in faults_in(tmp_path, text) if one.kind == "changed"]
+    with hb.Bridge(tmp_path / "scene.xml", clock=hb.SimulatedClock()) as bridge:
+        told = [each for each in bridge.scene.changes if each.startswith("weight of the tool")]
+    assert [each in changed[0] for each in told] == [True] * is_carried == [True] * len(changed)
 
 
 def test_a_tool_that_starts_in_a_height_field_is_told_to_start_outside(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             f"{places.option_change('timestep', f'{case.period:g}')}, or check with --rate "
             f"{1 / step:g}",
         )
-    for change in case.differences:
+    for change in (*case.differences, *case.carried_weight()):
         if change.subject not in ("time step", "integrator", "solver", "overlap"):
             words = change.words if change.treatment.is_rigid else change  # the rest is the remedy
             yield Fault(
@@ -87,6 +87,7 @@ side or its base, and not to the place that was meant."""
 
 _OF_SUBJECT = {
     "start": APART,
+    "weight": 'gravcomp="1" in the bodies of the tool, or less mass',
     "nested parts": "an <exclude> of their bodies in the file's <contact>",
     "memory": "that memory in <size>, in place of njmax, nconmax and nstack",
 }
