@@ -387,6 +387,18 @@ def refuse_overwriting(record: Path | None, *devices: str, overwrite: bool) -> N
             raise RecordingError(f"'{motion}' is the motion of the run; choose another file")
 
 
+def refuse_without_hand(options: BridgeOptions, infos: Sequence[DeviceInfo]) -> None:
+    """Refuses options that only a hand gives an effect, where the motion is prescribed."""
+    if not all(info.is_prescribed for info in infos):
+        return
+    for name, value in (("ramp", options.limits.ramp), ("probe", options.probe)):
+        if value:
+            raise HapticBridgeError(
+                f"--{name} has no effect on the device '{infos[0].name}', as its motion is "
+                "prescribed and no hand feels a force; leave it out"
+            )
+
+
 def print_summary(summary: Summary, scene: Scene, record: Path | None, *, as_json: bool) -> None:
     """Prints a run's summary, for a reader or as JSON with what was told of its scene before."""
     if as_json:
@@ -496,6 +508,7 @@ class Run:
             device = device_for(scene, self.device, notify, joint)
             # what is refused from here on must not leave it claimed
             stack.callback(checked(device).close)
+            refuse_without_hand(self.options, [device.info])
             chosen = self._for_devices([device.info])
             if joint and self.grip_axis is None and device.info.grip_axis is None:
                 notify(f"'{device.info.name}' has no grip axis, so joint '{joint}' moves freely")
@@ -633,6 +646,7 @@ class Run:
             stack.callback(opened.close)
             infos.append(opened.info)
             grasps.append(self._grasp(grip, joint, opened))
+        refuse_without_hand(self.options, infos)
         one = self._without_buttons()._for_devices(infos)
         if self.options.substeps is None:
             with working("trying the scene"):
