@@ -41,6 +41,20 @@ def test_check_tells_counts_stiffness_and_cost(tmp_path: Path, call: Called) -> 
     assert "(contacts of the scene, by its solref and solimp)" in out
 
 
+def test_check_prints_every_change_of_a_run(tmp_path: Path, call: Called) -> None:
+    """A seventh change is not counted as one more of its kind: it is another change."""
+    path = tmp_path / "changed.xml"
+    path.write_text(
+        """<mujoco><option timestep="0.001" iterations="7" ls_iterations="7" tolerance="1e-3"
+        ls_tolerance="0.1" impratio="3" noslip_iterations="2"/><worldbody><body><freejoint/>
+        <geom size=".02" mass=".1"/><site name="grip"/></body></worldbody></mujoco>"""
+    )
+    _, out, _ = call("check", path)
+    names = "iterations", "ls_iterations", "tolerance", "ls_tolerance", "impratio", "cone"
+    assert [f"a change, {name}: " in out for name in (*names, "noslip_iterations")] == [True] * 7
+    assert "more of 'changed'" not in out
+
+
 @pytest.mark.parametrize(
     ("contact", "words"),
     [("rigid", "as rigid impacts"), ("scene", "by MuJoCo's springs, as in the file")],

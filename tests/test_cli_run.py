@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import itertools
 import json
 import math
 import os
@@ -37,6 +38,36 @@ def test_run_prints_the_summary_as_json(call: Called, tmp_path: Path) -> None:
     summary = json.loads(out)
     assert (summary["ticks"], summary["verdict"]) == (100, "passive")
     assert summary["recording"] == str(path)
+
+
+def test_json_of_a_run_has_what_was_told_of_its_scene(call: Called, tmp_path: Path) -> None:
+    """A program that reads the summary learns of changes and faults as a reader of the text."""
+    path = tmp_path / "arm.xml"
+    path.write_text(FELT_WRONG.format(turn='range="-0.78 0.78"', reach=0.15, width=0.01))
+    command = ("run", path, "--fast", "--duration", 0.01)
+    told = call(*command)[2]
+    summary = json.loads(call(*command, "--json")[1])
+    assert [line for line in summary["scene_changes"] if line not in told] == []
+    assert len(summary["scene_changes"]) == told.count("changed in the scene: ") > 1
+    assert len(summary["scene_findings"]) == told.count("warning: joint 'turn'") == 1
+
+
+@pytest.mark.parametrize("named", [("--ramp", 0.2), ("--probe",)])
+@pytest.mark.parametrize("hands", [1, 2])
+def test_what_only_a_hand_gives_an_effect_is_refused_without_one(
+    call: Called, tmp_path: Path, named: tuple[object, ...], hands: int
+) -> None:
+    """A motion that is prescribed would be the same with it."""
+    motion = tmp_path / "hand.csv"
+    motion.write_text("t,x,y,z\n0,0,0,0\n1,0.001,0,0\n")
+    led: tuple[object, ...] = ("peg_in_hole", "--device", f"trajectory:{motion}")
+    if hands == 2:
+        each = (("--hand", f"{grip}=trajectory:{motion}") for grip in ("bolt", "wrench"))
+        led = ("nut_and_wrench", *itertools.chain(*each))
+    command = ("run", *led, "--fast", "--duration", 0.01)
+    code, _, err = call(*command, *named)
+    assert (code, f"{named[0]} has no effect on the device" in err) == (2, True)
+    assert call(*command)[0] == 0
 
 
 FELT_WRONG = """<mujoco>

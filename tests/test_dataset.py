@@ -319,7 +319,8 @@ def test_a_programs_run_has_its_tool_and_says_where_it_was_placed_anew(
         (["--format", "csv", "--fps", "3"], "--fps goes with"),
         (["--format", "lerobot", "--from", "1"], "whole recordings"),
         (["--format", "lerobot", "--fps", "0"], "fps"),
-        (["--format", "lerobot", "--size", "3", "3"], "width"),
+        (["--format", "lerobot", "--camera", "free", "--size", "3", "3"], "width"),
+        (["--format", "robomimic", "--size", "32", "32"], "--size without --camera"),
     ],
 )
 def test_options_that_do_not_go_together_are_a_sentence(

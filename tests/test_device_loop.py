@@ -251,6 +251,9 @@ def test_steps_that_are_no_whole_ticks_add_up_to_their_time(
         ("remote:127.0.0.1:1", {"token": "t"}, "no device loop answers at 127.0.0.1:1"),
         (5, {}, "device is 5; it must be a name"),
         ("simulated", {"recording": ""}, "recording is ''; it must be the name of a file"),
+        ("simulated", {"tool_weight": False}, "tool-weight is for a scene that hapticbridge"),
+        ("simulated", {"ramp": 0.2}, "the force begins at zero and rises within 20 ms"),
+        ("simulated", {"probe": True, "is_simulated": True}, "probe takes a second before"),
     ],
 )
 def test_a_loop_that_cannot_start_says_why(device: str, options: Any, words: str) -> None:

@@ -22,11 +22,13 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from recording_cases import EPOCH, META, random_rows, write
 
+from hapticbridge.clock import SimulatedClock
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import install_command
 from hapticbridge.kernel.record import FORMAT, TICK_DTYPE, TickFlag
 from hapticbridge.recording import read_recording, reader
 from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.hands import Grasp
 from hapticbridge.tools.export import ENERGIES, Part, export, sidecar_of
 from hapticbridge.tools.export import FORMATS as WRITERS
 
@@ -406,6 +408,43 @@ def test_every_path_of_the_layout_is_in_the_recording(run_file: Path, tmp_path: 
         return shown(part["first"]) + shown(part["second"])
 
     assert sorted(shown(layout["layout"])) == sorted(panels)
+
+
+@pytest.mark.parametrize(
+    "named", [("--from", 0.01), ("--to", 0.02), ("--hand", "grip"), ("--hand", "another")]
+)
+def test_a_layout_takes_no_part_of_a_recording(
+    run_file: Path, tmp_path: Path, named: tuple[str, object], call: Called
+) -> None:
+    """It would show the whole, and say that it wrote a part."""
+    target = tmp_path / "layout.json"
+    code, _, err = call("export", run_file, "--format", "foxglove", *named, "--out", target)
+    assert code == 2
+    assert "have no effect on foxglove" in err
+    assert not target.exists()
+
+
+def test_a_layout_does_not_say_that_it_holds_ticks(
+    run_file: Path, tmp_path: Path, call: Called
+) -> None:
+    command = "export", run_file, "--format", "foxglove", "--overwrite", "--out"
+    out = call(*command, tmp_path / "layout.json")[1]
+    assert "ticks" not in out
+    assert "a layout to import where" in out
+    assert json.loads(call(*command, tmp_path / "layout.json", "--json")[1])["ticks"] == 0
+
+
+def test_a_layout_of_two_hands_needs_none_named(tmp_path: Path) -> None:
+    run, target = tmp_path / "two.mcap", tmp_path / "layout.json"
+    grasps = Grasp("bolt", "simulated"), Grasp("wrench", "simulated")
+    with Bridge("nut_and_wrench", grasps, clock=SimulatedClock(), recording=run) as bridge:
+        bridge.run(duration=0.02)
+    export(run, "foxglove", target)
+    with run.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    topics = json.loads(target.read_text())["configById"]["3D!scene"]["topics"]
+    assert set(topics) <= {channel.topic for channel in summary.channels.values()}
 
 
 def test_rerun_reads_its_file(run_file: Path, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -16,20 +17,21 @@ from hapticbridge.check.observe import MAX_WORK, Observation, observe
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import default_coupling
-from hapticbridge.demand.methods import RIGID, default_method
+from hapticbridge.demand.methods import RIGID, default_method, prepare
 from hapticbridge.demand.pulse import Tap
 from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice
 from hapticbridge.device.base import checked_number
 from hapticbridge.device.motion_file import motion_in, read_motion, read_recorded
 from hapticbridge.device.trajectory import DEFAULT_SECONDS, lissajous
-from hapticbridge.errors import SceneError
+from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.run.options import BridgeOptions, RunSetup, Workspace
 from hapticbridge.scene import Scene, SceneSource, compile_scene
 from hapticbridge.scene.fault import CompiledScene
 from hapticbridge.scene.source_map import Places
+from hapticbridge.scene.treatment import SceneChange
 
 # Motion for a check: the scene's own hand path, a file of poses, or a recording
 
@@ -115,6 +117,7 @@ class SceneUnderCheck(CompiledScene):
         motion_fault: Reason why the motion did not finish.
         contact: Contact of the run that the scene is checked for: ``rigid``, the default of a run,
             or ``scene``, MuJoCo's own.
+        differences: Differences of the run from the file, those by its contacts too.
     """
 
     info: DeviceInfo
@@ -130,6 +133,7 @@ class SceneUnderCheck(CompiledScene):
     observation: Observation | None = None
     motion_fault: str = ""
     contact: Literal["rigid", "scene"] = "rigid"
+    differences: tuple[SceneChange, ...] = ()
 
     @property
     def is_rigid(self) -> bool:
@@ -146,15 +150,31 @@ class SceneUnderCheck(CompiledScene):
         """Tap of the tool in a run with pulses of blows; None if it can have none."""
         if not self.is_rigid:
             return None
+        setup = self._setup(self.scene, impact_pulses=1.0)
+        return setup.tap()
+
+    def _setup(self, scene: Scene, impact_pulses: float = 0.0) -> RunSetup:
+        """Returns the setup of a run of the scene on the simulated device."""
         options = BridgeOptions(
             rate=1.0 / self.period,
+            contact=self.contact,
             workspace=Workspace(scale=self.scale, force_scale=self.scale),
-            impact_pulses=1.0,
-        ).for_scene(self.scene.model)
-        setup = RunSetup.resolve(
-            self.scene, self.info, self.coupling, options, SimulatedClock(), is_recorded=False
-        )
-        return setup.tap()
+            impact_pulses=impact_pulses,
+        ).for_scene(scene.model)
+        clock = SimulatedClock()
+        return RunSetup.resolve(scene, self.info, self.coupling, options, clock, is_recorded=False)
+
+    def carried_weight(self) -> tuple[SceneChange, ...]:
+        """Returns the change of a run whose device cannot hold the tool; empty if it can."""
+        with suppress(HapticBridgeError):  # of a scene that a run refuses
+            scene = compile_scene(self.source, self.scene.grip, warns=False, checks_start=False)
+            setup = self._setup(scene)
+            prepare(
+                scene, setup.coupling, setup.scene_period, setup.substeps, setup.method, warns=False
+            )
+            setup.holding(self.samples[:1], None)
+            return tuple(each for each in scene.differences if each.subject == "weight")
+        return ()
 
     @property
     def law(self) -> Coupling:
@@ -234,6 +254,8 @@ def open_case(
     except (SceneError, mujoco.FatalError) as error:
         fault = " ".join(str(error).split())
     finally:
+        scene.set_contact(is_rigid=use.contact == RIGID)
+        differences = scene.differences
         scene.set_contact(is_rigid=False)  # the file's own settings are what the rules examine
     return SceneUnderCheck(
         source=source,
@@ -252,6 +274,7 @@ def open_case(
         observation=observation,
         motion_fault=fault,
         contact=use.contact,
+        differences=differences,
     )
 
 

@@ -64,12 +64,13 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             f"{places.option_change('timestep', f'{case.period:g}')}, or check with --rate "
             f"{1 / step:g}",
         )
-    for change in case.scene.differences:
+    for change in (*case.differences, *case.carried_weight()):
         if change.subject not in ("time step", "integrator", "solver", "overlap"):
+            words = change.words if change.treatment.is_rigid else change  # the rest is the remedy
             yield Fault(
                 "changed",
                 places.setting(change.treatment.settings),
-                f"the scene runs with a change, {change}, because {change.treatment.why}",
+                f"the scene runs with a change, {words}, because {change.treatment.why}",
                 _OF_SUBJECT.get(change.subject) or _instead(change.treatment),
             )
     for name, concern in unmetered_work(case.model).items():
@@ -86,6 +87,7 @@ side or its base, and not to the place that was meant."""
 
 _OF_SUBJECT = {
     "start": APART,
+    "weight": 'gravcomp="1" in the bodies of the tool, or less mass',
     "nested parts": "an <exclude> of their bodies in the file's <contact>",
     "memory": "that memory in <size>, in place of njmax, nconmax and nstack",
 }

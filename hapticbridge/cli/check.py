@@ -141,6 +141,9 @@ def _numbers(trial: VariantVerdict) -> list[str]:
 MAX_NAMED = 4
 """Number of things of a kind that are named; the rest is counted."""
 
+_ALL_NAMED = {"changed"}
+"""Kinds of findings that are all printed: one change of a run is not like another."""
+
 _SHOWN = 0.01  # s/s; a stage that takes less of the tick is left out
 _GLUE = "\x00"  # in place of a space at which a line is not to end
 _WIDTH = 96  # letters of a line of text below a fault
@@ -300,7 +303,7 @@ def _print_findings(faults: list[Fault], lead: str) -> None:
     seen: Counter[str] = Counter()
     for number, fault in enumerate(faults, 1):
         seen[fault.kind] += 1
-        if seen[fault.kind] > MAX_NAMED:
+        if seen[fault.kind] > MAX_NAMED and fault.kind not in _ALL_NAMED:
             continue
         out.print(f"  {number:>2} [yellow]{plain(fault.kind)}[/]  {plain(str(fault.place))}")
         # what stands in quotes is to be copied: it stays on one line
@@ -309,7 +312,7 @@ def _print_findings(faults: list[Fault], lead: str) -> None:
             out.print(f"     {plain(line.replace(_GLUE, ' '))}")
         out.print(f"     [green]{lead}:[/] {plain(fault.change)}")
     for kind, count in seen.items():
-        if count > MAX_NAMED:
+        if count > MAX_NAMED and kind not in _ALL_NAMED:
             out.print(f"  and {count - MAX_NAMED} more of '{plain(kind)}': --json lists all")
 
 

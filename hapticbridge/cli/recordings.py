@@ -18,7 +18,7 @@ from hapticbridge.recording import RecordingFile, open_recording, read_recording
 from hapticbridge.replay.film import USUAL_SHOT, Shot, draw
 from hapticbridge.tools.compare import Comparison, Difference, compare
 from hapticbridge.tools.dataset import DATASETS, write_dataset
-from hapticbridge.tools.export import EVERYTHING, Part, export, time_of
+from hapticbridge.tools.export import EVERYTHING, LAYOUT, Part, export, time_of
 from hapticbridge.units import format_count, format_si
 from hapticbridge.view import Address
 from hapticbridge.view.window import check_view
@@ -129,9 +129,9 @@ class Export:
     'parquet', 'csv' and 'hdf5' have a row per tick, with units, metadata and events. 'rerun' is a
     file for the viewer of that name, 'foxglove' a layout for Foxglove, which opens the recording
     itself. 'lerobot' and 'robomimic' write a folder with an episode for each recording, simulated
-    again. --from and --to cut a piece out of a run, for tables; the times of its marks are printed.
-    Of a damaged recording tables are written as far as it can be read, with exit code 1; a data set
-    refuses it and a cut one.
+    again. --from and --to cut a piece out of a run, for tables and rerun; the times of its marks
+    are printed. Of a damaged recording tables are written as far as it can be read, with exit code
+    1; a data set refuses it and a cut one.
 
     Example:
         hapticbridge export run.mcap --format csv --from 12.5 --to 20 --out grasp.csv
@@ -197,7 +197,10 @@ class Export:
             print_json(facts)
         else:
             names = ", ".join(plain(str(file)) for file in done.files)
-            out.print(f"wrote {names}: {done.ticks} ticks, {len(done.events)} events")
+            held = f"{done.ticks} ticks, {len(done.events)} events"
+            if self.form == LAYOUT:
+                held = f"a layout to import where {plain(str(self.files[0]))} is open"
+            out.print(f"wrote {names}: {held}")
             if marks:
                 out.print(f"marks at {', '.join(f'{time:.3f} s' for time in marks)}")
         _tell_odd(done.odd)
@@ -214,6 +217,11 @@ class Export:
             raise RecordingError(
                 "--from, --to, --overwrite and --hand go with tables; a data set has whole "
                 "recordings, in a new folder"
+            )
+        if self.size is not None and self.camera is None:
+            raise RecordingError(
+                "--size without --camera has no effect: the data set has no pictures; name a "
+                "camera of the scene, or 'free'"
             )
         width, height = self.size or (320, 240)
         shot = Shot(

@@ -388,10 +388,23 @@ def refuse_overwriting(record: Path | None, *devices: str, overwrite: bool) -> N
             raise RecordingError(f"'{motion}' is the motion of the run; choose another file")
 
 
-def print_summary(summary: Summary, record: Path | None, *, as_json: bool) -> None:
-    """Prints what a run has come to, for a reader or as JSON with the recording's name."""
+def refuse_without_hand(options: BridgeOptions, infos: Sequence[DeviceInfo]) -> None:
+    """Refuses options that only a hand gives an effect, where the motion is prescribed."""
+    if not all(info.is_prescribed for info in infos):
+        return
+    for name, value in (("ramp", options.limits.ramp), ("probe", options.probe)):
+        if value:
+            raise HapticBridgeError(
+                f"--{name} has no effect on the device '{infos[0].name}', as its motion is "
+                "prescribed and no hand feels a force; leave it out"
+            )
+
+
+def print_summary(summary: Summary, scene: Scene, record: Path | None, *, as_json: bool) -> None:
+    """Prints a run's summary, for a reader or as JSON with what was told of its scene before."""
     if as_json:
-        print_json(summary.to_dict() | {"recording": str(record or "") or None})
+        told = {"scene_changes": scene.changes, "scene_findings": scene.findings}
+        print_json(summary.to_dict() | {"recording": str(record or "") or None} | told)
         return
     for line in str(summary).splitlines():
         out.print(plain(line))
@@ -496,6 +509,7 @@ class Run:
             device = device_for(scene, self.device, notify, joint)
             # what is refused from here on must not leave it claimed
             stack.callback(checked(device).close)
+            refuse_without_hand(self.options, [device.info])
             chosen = self._for_devices([device.info])
             if joint and self.grip_axis is None and device.info.grip_axis is None:
                 notify(f"'{device.info.name}' has no grip axis, so joint '{joint}' moves freely")
@@ -633,6 +647,7 @@ class Run:
             stack.callback(opened.close)
             infos.append(opened.info)
             grasps.append(self._grasp(grip, joint, opened))
+        refuse_without_hand(self.options, infos)
         one = self._without_buttons()._for_devices(infos)
         if self.options.substeps is None:
             with working("trying the scene"):
@@ -711,16 +726,16 @@ class Run:
             summary = bridge.run(self._duration(bridge.device.info))
         except SafetyTrip:
             stack.close()
-            self._print(bridge.summary())
+            self._print(bridge.summary(), bridge.scene)
             raise
         stack.close()
         if not summary.ticks and (name := bridge.session.signal):
             raise StopSignal(Signals[name])
-        self._print(summary)
+        self._print(summary, bridge.scene)
         return exit_code(summary)
 
-    def _print(self, summary: Summary) -> None:
-        print_summary(summary, self.record, as_json=self.as_json)
+    def _print(self, summary: Summary, scene: Scene) -> None:
+        print_summary(summary, scene, self.record, as_json=self.as_json)
         if not self.as_json and self._is_viewed and self.record is not None:
             notify(f"the page ends with the run; 'hapticbridge view {self.record}' plays it")
 

@@ -30,6 +30,7 @@ from hapticbridge.cli.terminal import err, notify, working
 from hapticbridge.clock import RealClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import refuse_simulated_time
+from hapticbridge.errors import HapticBridgeError
 from hapticbridge.program.loop_process import TOKEN_VARIABLE
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.endpoint import CREDIT, Endpoint, GrantedClock, posted_scene, program_options
@@ -109,6 +110,10 @@ class Serve:
         clock = GrantedClock() if self.fast else RealClock()
         refuse_simulated_time(self.device, clock)
         token = os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(18)
+        if self.fast and self.options.probe:
+            raise HapticBridgeError(
+                "probe takes a second before the program may move simulated time; leave it out"
+            )
         options = program_options(self.options)
         is_shown = not self.as_json and err.is_terminal
         is_viewed = self.view or is_mouse(self.device)
@@ -156,7 +161,8 @@ class Serve:
             finally:
                 endpoint.close(error)
                 stack.close()
-                print_summary(summary := bridge.summary(), self.record, as_json=self.as_json)
+                summary = bridge.summary()
+                print_summary(summary, bridge.scene, self.record, as_json=self.as_json)
         return exit_code(summary)
 
     def _on_leave(self, bridge: Bridge, clock: RealClock | GrantedClock) -> Callable[[str], None]:

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.clock import SimulatedClock
+from hapticbridge.demand.guard import FADE
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 from hapticbridge.kernel.record import POST_DTYPE
 from hapticbridge.kernel.tick_guard import DEVICE_BUTTONS
@@ -37,11 +38,11 @@ from hapticbridge.program.messages import (
 )
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.commands import Repeat
-from hapticbridge.run.options import AUTO, BridgeOptions
+from hapticbridge.run.options import AUTO, DEFAULT_OPTIONS, BridgeOptions
 from hapticbridge.run.posted_scene import is_post
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.compile import PROGRAM_CREDIT
-from hapticbridge.units import format_number
+from hapticbridge.units import format_number, format_si
 
 CREDIT = 0.05
 """Usual credit of another program in J: 5 N over 1 cm, a little more than the guard's usual energy
@@ -107,11 +108,17 @@ def program_options(options: BridgeOptions) -> BridgeOptions:
     """Returns options for another program's scene, of which the law is the coupling itself.
 
     Raises:
-        HapticBridgeError: An option is for a scene that the bridge steps.
+        HapticBridgeError: An option is for a scene that the bridge steps, or has no effect here.
     """
-    for name in ("method", "contact", "substeps"):
-        if getattr(options, name) is not None:
-            raise HapticBridgeError(f"{name} is for a scene that hapticbridge steps; leave it out")
+    for name in ("method", "contact", "substeps", "tool_weight"):
+        if getattr(options, name) != getattr(DEFAULT_OPTIONS, name):
+            words = f"{name.replace('_', '-')} is for a scene that hapticbridge steps"
+            raise HapticBridgeError(f"{words}; leave it out")
+    if options.limits.ramp is not None:
+        raise HapticBridgeError(
+            "ramp is for a scene that hapticbridge steps; leave it out: where a program shows its "
+            f"tool, the force begins at zero and rises within {format_si(FADE, 's')}"
+        )
     rate = PROGRAM_RATE if options.scene_rate == AUTO else options.scene_rate
     if options.scene_ticks == 0 and rate != PROGRAM_RATE:  # faster than every second tick
         rate = 0.5 * options.loop_rate

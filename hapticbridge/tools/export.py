@@ -367,7 +367,7 @@ class FoxgloveSink:
         path.write_text(json.dumps(layout, indent=1) + "\n", encoding="utf-8")
 
     def add(self, ticks: NDArray[np.void]) -> None:
-        """Implements ``Sink.add``: the ticks stay in the recording."""
+        """Implements ``Sink.add``; never called, as the ticks stay in the recording."""
 
     def close(self) -> None:
         """Implements ``Sink.close``."""
@@ -398,6 +398,10 @@ FORMATS: dict[str, tuple[type[Sink], tuple[str, ...]]] = {
 TABLES = ("parquet", "csv", "hdf5")
 """Formats with a column for each number."""
 
+
+LAYOUT = "foxglove"
+"""Format that holds nothing of the recording: it arranges the topics of the whole, of its first
+hand if there are several, as only the first has topics of its pose."""
 
 EVERYTHING = (-math.inf, math.inf)
 """Unlimited span in s of the run's clock."""
@@ -467,8 +471,8 @@ class Exported:
     Attributes:
         files: The table, then its sidecar if there is one.
         recording: The recording without its ticks.
-        ticks: Count of rows in the table.
-        events: Events that were written.
+        ticks: Count of rows in the table; 0 of a layout.
+        events: Events that were written; none of a layout.
         odd: Columns of sensors whose readings the file alone would not give, by the reason.
     """
 
@@ -518,8 +522,8 @@ def export(
         HapticBridgeError: The scene has no sensors, or cannot be simulated again.
     """
     sink_type, endings = _sink(form)
-    span, hand = part.span, part.hand
-    recording = open_recording(path, None if hand is None else hand_named(path, hand))
+    span = part.span
+    recording = _opened(path, form, part)
     target = target_for(path, form) if target is None else Path(target)
     if target.suffix.lower() not in endings:
         raise RecordingError(f"the {form} file '{target}' must end in {' or '.join(endings)}")
@@ -537,7 +541,7 @@ def export(
     try:
         sink = sink_type(draft, piece, columns)
         try:
-            for ticks in _blocks(recording, span):
+            for ticks in () if form == LAYOUT else _blocks(recording, span):
                 sink.add(ticks)
                 count += len(ticks)
         finally:
@@ -553,7 +557,20 @@ def export(
             with suppress(OSError):
                 written.unlink(missing_ok=True)
     odd = columns.odd if isinstance(columns, _ColumnsWithSensors) else {}
-    return Exported(files, recording, count, tuple(piece.events), odd)
+    events = () if form == LAYOUT else tuple(piece.events)
+    return Exported(files, recording, count, events, odd)
+
+
+def _opened(path: str | Path, form: str, part: Part) -> RecordingFile:
+    """Opens the recording of a hand; for a layout that of the first."""
+    if form != LAYOUT:
+        return open_recording(path, None if part.hand is None else hand_named(path, part.hand))
+    if part.span != EVERYTHING or part.hand is not None:
+        raise RecordingError(
+            f"--from, --to and --hand have no effect on {form}: a layout arranges the topics of "
+            "the whole recording, with the poses of its first hand; leave them out"
+        )
+    return open_recording(path, 0)
 
 
 def time_of(event: Mapping[str, Any]) -> float:
