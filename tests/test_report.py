@@ -460,6 +460,28 @@ def test_a_pump_is_behind_a_trip_if_it_moves_and_can_move_the_tool(
         assert told.partition(":")[0] in note
 
 
+def test_a_connect_that_begins_open_is_the_cause_and_rigid_contacts_hold_it(tmp_path: Path) -> None:
+    # an arm of 0.1 m whose end is tied to a point 0.15 m away
+    text = """<mujoco><worldbody><body name="arm"><joint axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 .1 0 0" size=".005"/><site name="end" pos=".1 0 0"/></body>
+      <site name="post" pos="0 .02 .15"/><body pos=".5 0 0"><freejoint/><site name="grip"/>
+      <geom size=".02" mass=".1"/></body></worldbody><equality>
+      <connect name="tie" site1="end" site2="post"/></equality></mujoco>"""
+    scene, path = tmp_path / "scene.xml", tmp_path / "run.mcap"
+    scene.write_text(text)
+    for contact, verdict in (("scene", "active"), ("rigid", "passive")):
+        with pytest.warns(UserWarning, match="connect 'tie' .* starts .* off"):
+            recorded(path, scene, duration=0.2, contact=contact)
+        report = audit(path)
+        assert report.verdict == verdict
+        if verdict == "active":
+            cause = cause_by(evidence_of(read_recording(path)), report)
+            assert cause.kind == "constraint"
+            assert cause.evidence.startswith("connect 'tie' of site 'end' and 'post' did")
+            assert "--contact scene" in cause.remedy
+        path.unlink()
+
+
 def test_a_tendon_whose_length_jumps_is_named_as_the_cause(tmp_path: Path) -> None:
     path, scene = tmp_path / "run.mcap", tmp_path / "cord.xml"
     way = '<site site="a"/><geom geom="brim"/><site site="b"/>'

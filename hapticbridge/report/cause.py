@@ -534,36 +534,37 @@ def _constraint_cause(
 ) -> Cause | None:
     """Returns a soft equality or limit as the cause, if its work is most of the energy.
 
-    MuJoCo's own constraint is a spring, whose energy no meter knows. Its work in a tick of T is
-    f·(J q̇) T, with the forces f and rows J of a step and the mean q̇ of the speeds around it.
+    MuJoCo's own constraint is a spring, whose energy no meter knows.
     """
     model, parameters = evidence.model, evidence.parameters
     if model is None or parameters.is_rigid:
         return None
     if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
         return None
-    work, last = defaultdict[str, float](float), np.zeros(model.nv)
-    contact = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
-    try:
-        whole = slice(max(window.start - 1, 0), window.stop)
-        for tick, run in enumerate(_runs_in(evidence, whole), whole.start):
-            data = run.data
-            rates = constraint_rows(data) @ (last + data.qvel) / 2.0
-            last = np.array(data.qvel)
-            joules = data.efc_force * rates * parameters.period * (tick >= window.start)
-            for row in np.flatnonzero(data.efc_type < contact).tolist():
-                work[constraint_name(model, data, row)] += float(joules[row])
-    except RecordingError:
-        return None
-    name, given = max(work.items(), key=lambda each: each[1], default=("", 0.0))
-    if given <= MOST * float(gained.sum()):
+    works = _works(evidence.recording, model, window, _constraint_powers)
+    name = max(works, key=lambda each: works[each], default="")
+    if not name or works[name] <= MOST * float(gained.sum()):
         return None
     return Cause(
         "constraint",
-        f"{name} did {format_energy(given)} of work until then: with the scene's "
-        "own contacts it is a spring, whose energy no meter knows",
+        f"{name} did {format_energy(works[name])} of work in the {WINDOW:g} s before: with the "
+        "scene's own contacts it is a spring, whose energy no meter knows",
         "leave out --contact scene: rigid contacts hold it without a spring",
     )
+
+
+def _constraint_powers(data: mujoco.MjData) -> dict[str, float]:
+    """Returns the powers in W of equalities, dry friction and limits, by their names.
+
+    They are f·(J q̇), with the forces f and rows J of a step and the mean q̇ of its speeds.
+    """
+    speeds = data.qvel - 0.5 * data.model.opt.timestep * data.qacc
+    powers, found = data.efc_force * (constraint_rows(data) @ speeds), {"": 0.0}
+    is_contact = data.efc_type >= mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS.value
+    for row in np.flatnonzero(~is_contact).tolist():
+        name = constraint_name(data.model, data, row)
+        found[name] = found.get(name, 0.0) + float(powers[row])
+    return found
 
 
 def _cause_without_contact(
