@@ -758,6 +758,38 @@ def test_a_body_that_falls_for_ever_is_told(tmp_path: Path, floor: str, is_told:
         assert fallen == pytest.approx(4.905 * seconds**2, rel=0.05)
 
 
+LOWERED = "t,x,y,z\n" + "".join(f"{0.01 * k:.2f},0,0,{-0.006 * k:.3f}\n" for k in range(21))
+"""A hand that goes down by 0.12 m in 0.2 s, in which a body falls by 0.196 m."""
+
+TRAY = """<body name="tray">{}<geom type="box" size=".05 .05 .01" mass="1"/><site name="grip"/>
+  </body><body name="ball" pos="0 0 0.03"><freejoint/><geom size="0.02" mass="0.01"/></body>"""
+
+
+@pytest.mark.parametrize("joint", ['<joint type="slide" axis="0 0 1"/>', "<freejoint/>"])
+def test_a_body_that_is_led_down_does_not_fall(joint: str, tmp_path: Path) -> None:
+    """The hand holds the tray, and a ball rides on it."""
+    scene = written(tmp_path, mjcf(HEAVY, GOOD_CONTACT, body=TRAY.format(joint)), LOWERED)
+    assert "falling body" not in kinds(faults_of(scene, scene.with_suffix(".csv")))
+
+
+ROPE = """<mujoco><worldbody><body name="tool"><joint name="up" type="slide" axis="0 0 1"/>
+<geom size=".02" mass="{}" contype="0" conaffinity="0"/><site name="grip"/></body>
+<body name="load" pos="1 0 0"><joint name="down" type="slide" axis="0 0 1"/>
+<geom size=".05" mass="{}" contype="0" conaffinity="0"/></body></worldbody>
+<tendon><fixed name="rope"><joint joint="up" coef="1"/><joint joint="down" coef="-1"/></fixed>
+</tendon><equality><tendon tendon1="rope"/></equality></mujoco>"""
+
+
+@pytest.mark.parametrize(("tool", "load", "is_load"), [(0.02, 1.0, True), (1.0, 0.02, False)])
+def test_a_load_on_a_rope_is_told_apart_from_the_weight_of_the_tool(
+    tool: float, load: float, tmp_path: Path, *, is_load: bool
+) -> None:
+    found = faults_in(tmp_path, ROPE.format(tool, load))
+    (fault,) = [each for each in found if each.kind == "heavy tool"]
+    assert ("most of it from bodies that hang on the tool" in fault.sentence) == is_load
+    assert ("in those that hang on it" in fault.change) == is_load
+
+
 def test_what_a_run_changes_by_itself_and_a_motor_that_pushes_are_notes(tmp_path: Path) -> None:
     joint = '<joint name="rail" axis="1 0 0" type="slide"/>'
     slide = f'<body name="tool">{joint}<geom size="0.01" mass="1"/>'

@@ -557,6 +557,27 @@ def test_a_recording_is_replaced_but_not_by_a_run_that_follows_it(
     assert call(*options)[0] == 0
 
 
+HOISTED = """<mujoco><worldbody><body><joint name="rail" type="slide" axis="0 0 1"/>
+<geom size=".02" mass="1"/><site name="grip"/></body></worldbody>
+<actuator><motor joint="rail"/></actuator>
+<keyframe><key name="home" ctrl="{}"/></keyframe></mujoco>"""
+"""A tool of 1 kg (9.81 N) on a rail, which a motor lifts."""
+
+
+@pytest.mark.parametrize(("lift", "bears"), [(5.7, "4.11 N"), (13.9, "4.09 N")])
+def test_a_motor_that_carries_a_part_of_the_weight_is_not_the_load(
+    call: Called, tmp_path: Path, lift: float, bears: str
+) -> None:
+    scene = tmp_path / "lifted.xml"
+    scene.write_text(HOISTED.format(lift))
+    _, _, err = call("run", scene, "--fast", "--duration", 0.01)
+    words = " ".join(err.split())
+    assert ("most of it from motors" in words) == (lift > 9.81)
+    assert (f"this tool weighs {bears} in the hand" in words) == (lift < 9.81)
+    assert bears in words
+    assert "--no-tool-weight" not in words  # which would leave the whole force of the motor
+
+
 @pytest.mark.parametrize("duration", ["1e306", "1e12"])
 def test_a_duration_without_end_is_refused(call: Called, duration: str) -> None:
     code, _, err = call("run", "point_mass", "--fast", "--duration", duration)

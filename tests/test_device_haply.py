@@ -210,6 +210,18 @@ def test_a_service_slower_than_the_loop_gets_the_newest_force_and_no_queue() -> 
     assert answers > 20
 
 
+def test_forces_of_a_loop_that_stalled_are_not_put_down_to_the_service() -> None:
+    """A loop makes up for lost ticks at once; the service answers within 50 µs."""
+    bench, device = started(work=5e-5)
+    ticks(device, bench.time, 20, FORCE)
+    assert device.remark == ""
+    for _ in range(5):  # one is under way already, another one is sent, and the last waits
+        device.write(FORCE)
+    assert device.remark == (
+        "3 forces were not sent: newer ones came before the service had answered earlier ones"
+    )
+
+
 @pytest.mark.parametrize(("travel", "work"), [(1e-4, 5e-5), (4e-4, 1e-4), (8e-4, 5e-4)])
 def test_rate_and_delay_are_measured(travel: float, work: float) -> None:
     device = HaplyBench(travel=travel, work=work).opened()

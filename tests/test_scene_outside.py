@@ -387,6 +387,27 @@ def test_heavy_pole_that_topples_in_the_hand_is_carried(
             pass
 
 
+def test_a_cart_that_its_motor_repels_neither_stands_upright_nor_topples(tmp_path: Path) -> None:
+    """Across gravity a motor gives 200 N/m away from the middle: 20 N at 0.1 m, not by weight."""
+    text = """<mujoco><worldbody><body><joint name="rail" type="slide" axis="1 0 0"/>
+      <geom size=".02" mass=".5"/><site name="grip"/></body></worldbody><actuator>
+      <general joint="rail" biastype="affine" biasprm="0 200 0"/></actuator></mujoco>"""
+    with started(tmp_path, text) as bridge:
+        assert not [change for change in bridge.scene.changes if "weight" in change]
+
+
+@pytest.mark.parametrize(("mass", "boulder", "is_carried"), [(0.05, 0.6, False), (2.0, 0.6, True)])
+def test_a_body_that_falls_on_the_tool_is_not_the_weight_of_the_tool(
+    tmp_path: Path, mass: float, boulder: float, *, is_carried: bool
+) -> None:
+    """A blow of far over 10 N comes to a tool whose weight is carried, too."""
+    text = f"""<mujoco><worldbody><body><freejoint/><geom size=".02" mass="{mass}"/>
+      <site name="grip"/></body><body pos="0 0 .3"><freejoint/>
+      <geom size=".05" mass="{boulder}"/></body></worldbody></mujoco>"""
+    with started(tmp_path, text) as bridge:
+        assert bridge.scene.is_carried == is_carried
+
+
 def test_hovering_quadrotor_does_not_topple(tmp_path: Path) -> None:
     """Thrust turns with the tool, so a tilt makes it drift, ever faster but not exponentially."""
     arms = [(0.1, 0.1), (-0.1, 0.1), (-0.1, -0.1), (0.1, -0.1)]

@@ -14,7 +14,7 @@ from hapticbridge.kernel.codes import held_body
 from hapticbridge.scene.fault import Fault, length, number, others, weight
 from hapticbridge.scene.handle import tied_trees
 from hapticbridge.scene.physics import body_inertia
-from hapticbridge.scene.rehearsal import static_load, wrench_sizes
+from hapticbridge.scene.rehearsal import along, static_load, wrench_sizes
 from hapticbridge.units import format_degrees, format_number
 
 WATER = 1000.0
@@ -167,7 +167,8 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
         trial = scene.for_trial()
         parameters = rehearsal_parameters(trial, case.setting)
         load = static_load(trial, parameters, is_lifted=True)
-        load -= static_load(trial, parameters, is_lifted=True, has_weight=False)
+        others = static_load(trial, parameters, is_lifted=True, has_weight=False)
+        load -= others
     except SceneError:  # another finding says why it cannot be stepped
         return
     force, torque = wrench_sizes(load)
@@ -192,12 +193,16 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     what, where = "the tool", "the body and those below it"
     if tied:
         what, where = "the tool, with what is tied to it,", f"{where}, and in those tied to it"
+    does = "; a run carries it where the device cannot, and with --no-tool-weight"
+    part = 0 if sag > MAX_SAG else 1
+    left = static_load(trial.with_tool_carried(), parameters, is_lifted=True) - others
+    if 2.0 * along(left, load)[part] > wrench_sizes(load)[part]:
+        does, where = ", most of it from bodies that hang on the tool", "those that hang on it"
     yield Fault(
         "heavy tool",
         case.places.find("body", int(of_tool[0])),  # the first that moves
         f"{what} weighs {weight(mass)}; where no contact, limit, equality, dry friction or "
-        f"motor carries it, the hand carries {' and '.join(parts)} at rest; a run carries it where "
-        "the device cannot, and with --no-tool-weight",
+        f"motor carries it, the hand carries {' and '.join(parts)} at rest{does}",
         f'gravcomp="1" in {where}, or less mass'
         + (", or a grip nearer to the centre of mass" if droop > MAX_DROOP else ""),
     )

@@ -73,7 +73,7 @@ from hapticbridge.scene.compile import custom_text
 from hapticbridge.scene.fault import weight
 from hapticbridge.scene.first_faults import worst_faults
 from hapticbridge.scene.physics import tool_masses
-from hapticbridge.scene.rehearsal import static_load, wrench_sizes
+from hapticbridge.scene.rehearsal import along, static_load, wrench_sizes
 from hapticbridge.scene.softness import bounces
 from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
 from hapticbridge.units import format_degrees, format_energy, format_number, format_si
@@ -310,7 +310,8 @@ def _heavy_load(setup: RunSetup, parameters: RunParameters, part: int) -> str:
         return format_si(setup.on_device(sizes)[part], unit)
 
     felt = in_hand(setup.load_at_rest(parameters))
-    others = wrench_sizes(static_load(scene, parameters, has_weight=False))
+    whole = static_load(scene, parameters)
+    others = along(static_load(scene, parameters, has_weight=False), whole)
     if 2.0 * others[part] > load:
         return (
             f"at rest the hand bears {felt}, {beside} beside the handle, most of "
@@ -323,19 +324,25 @@ def _heavy_load(setup: RunSetup, parameters: RunParameters, part: int) -> str:
             f"at rest the hand bears {felt}, {beside} beside the handle, from what "
             f"hangs or lies on the tool, whose weight is carried; {lift}"
         )
-    left = wrench_sizes(static_load(scene.with_tool_carried(), parameters))
-    alone = f"--no-tool-weight carries the tool alone (tried: the hand then bears {in_hand(left)})"
-    if 2.0 * left[part] > load:
+    left = static_load(scene.with_tool_carried(), parameters)
+    felt_alone = wrench_sizes(left)
+    alone = (
+        "--no-tool-weight carries the tool alone (tried: the hand then bears "
+        f"{in_hand(felt_alone)})"
+    )
+    # where a motor lifts the tool, it bears more
+    is_eased = felt_alone[part] < (1.0 - EASED) * load
+    if 2.0 * along(left, whole)[part] > load:
         verb = "makes" if part else "weighs"
-        is_eased = left[part] < (1.0 - EASED) * load
         remedy = f"{lift}, and {alone}" if is_eased else lift
         return f"what hangs or lies on the tool {verb} most of the {felt} {borne}; {remedy}"
-    own, whole = tool_masses(scene.model, scene.grip)
+    own, mass = tool_masses(scene.model, scene.grip)
     subject = "this tool"
-    if own < 0.5 * whole:
-        subject += f" with its links ({weight(whole)}, without them {weight(own)})"
+    if own < 0.5 * mass:
+        subject += f" with its links ({weight(mass)}, without them {weight(own)})"
     verb = f"turns the hand with {felt}" if part else f"weighs {felt} in the hand"
-    return f"{subject} {verb}, which holds it {beside} beside the handle; {alone}"
+    remedy = f"; {alone}" if is_eased else ""
+    return f"{subject} {verb}, which holds it {beside} beside the handle{remedy}"
 
 
 def is_mouse(device: str) -> bool:

@@ -490,8 +490,8 @@ class HaplyDevice:
     def remark(self) -> str:
         """Number of forces that a newer one overtook, as a clause; empty if there were none."""
         return (
-            f"{self._overtaken} forces were not sent, because the service answers slower than the "
-            "loop asks"
+            f"{self._overtaken} forces were not sent: newer ones came before the "
+            "service had answered earlier ones"
             if self._overtaken
             else ""
         )

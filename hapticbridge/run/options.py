@@ -78,6 +78,7 @@ from hapticbridge.scene.physics import geom_inertia, site_inertia
 from hapticbridge.scene.rehearsal import (
     HOLDING_STEPS,
     TIPPED,
+    along,
     holding_wrench,
     start_handle,
     static_load,
@@ -86,6 +87,11 @@ from hapticbridge.scene.rehearsal import (
 )
 from hapticbridge.theory.transfer import MAX_DELAY
 from hapticbridge.units import format_count, format_number, format_si
+
+OWN_PULL = 0.9
+"""Share of a pull that is left at a tool whose weight is carried, above which the pull is not of
+the tool; no unit. A body that falls on it leaves about all; with a smaller value a tool whose own
+weight gives a part of the pull would not be carried."""
 
 # Options of a user
 
@@ -737,24 +743,45 @@ class RunSetup(StepTimes):
             for part in over:
                 # else motors or springs push, more than the weight
                 is_heavy = weightless[part] <= max(most[part], pull[part] / 2)
-                if is_heavy and weight[part] > most[part]:
+                if (
+                    is_heavy
+                    and weight[part] > most[part]
+                    and self._is_own(parameters, part, float(pull[part]))
+                ):
                     return self._heavy(parameters, part, float(weight[part]))
         if pull[0] > most[0]:
             return ""
-        if (force := float(self.on_device((toppling_force(scene, parameters), 0.0))[0])) > most[0]:
+        force = self._toppling(scene, parameters)
+        if force > most[0] and self._toppling(scene.with_tool_carried(), parameters) <= most[0]:
             return (
                 f"it stands upright and topples: {TIPPED:g} m beside, it pulls with "
                 f"{format_number(force, 3)} N, and the device holds {format_number(most[0], 3)} N"
             )
         return ""
 
+    def _toppling(self, scene: Scene, parameters: RunParameters) -> float:
+        """Returns the force in N on the device with which a tool that has toppled pulls."""
+        return float(self.on_device((toppling_force(scene, parameters), 0.0))[0])
+
+    def _is_own(self, parameters: RunParameters, part: int, pull: float) -> bool:
+        """Returns True if a pull comes from the tool, or from what loads it at rest.
+
+        Else a body that falls on it or strikes it pulls as much at a tool that is carried.
+        """
+        at_rest = self.on_device(self.load_at_rest(parameters))[part]
+        if at_rest > self.on_device(parameters.levels_on_tool)[part]:
+            return True
+        carried = holding_wrench(self.scene.with_tool_carried(), parameters)
+        return bool(self.on_device(carried)[part] < OWN_PULL * pull)
+
     def _heavy(self, parameters: RunParameters, part: int, weight: float) -> str:
         """Returns the clause on a weight that pulls (part 0) or turns (part 1) the device."""
         verb, unit = (("pulls", "N"), ("turns", "N m"))[part]
         most = self.on_device(parameters.levels_on_tool)[part]
-        left = wrench_sizes(static_load(self.scene.with_tool_carried(), parameters))
-        is_laden = 2.0 * left[part] > self.load_at_rest(parameters)[part]
-        at_rest = format_si(self.on_device(left)[part], unit)
+        left = static_load(self.scene.with_tool_carried(), parameters)
+        own = along(left, static_load(self.scene, parameters))[part]
+        is_laden = 2.0 * own > self.load_at_rest(parameters)[part]
+        at_rest = format_si(self.on_device(wrench_sizes(left))[part], unit)
         laden = f"{at_rest} of it at rest from what hangs or lies on the tool, "
         return (
             f"within {format_si(HOLDING_STEPS * parameters.timestep, 's')} it {verb} with up to "

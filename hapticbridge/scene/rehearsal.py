@@ -400,6 +400,16 @@ def wrench_sizes(wrench: NDArray[np.float64]) -> tuple[float, float]:
     return float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
 
 
+def along(wrench: NDArray[np.float64], load: NDArray[np.float64]) -> tuple[float, float]:
+    """Returns the parts of a wrench's force and torque along those of a load, in N and N m.
+
+    Negative where the wrench is against the load, as a motor that lifts what the load is of.
+    """
+    sizes = np.maximum(wrench_sizes(load), np.finfo(float).tiny)
+    force, torque = (wrench * load).reshape(2, 3).sum(axis=1) / sizes
+    return float(force), float(torque)
+
+
 MAX_START_TWIST = 1.0
 """Largest angle in rad by which the handle is turned at the start to carry the tool's weight. A
 heavier tool sags; beyond a right angle the spring would lose its grip."""
