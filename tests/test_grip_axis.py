@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -96,6 +97,27 @@ def test_the_fingers_feel_the_spring_through_the_lever(scale: float | None) -> N
     force = -lever * spring * (angle + 0.1)
     assert device.felt[device.felt != 0.0][-1] == pytest.approx(force, rel=1e-3)
     assert device.sent[-1].tolist() == [[0.0] * 6] * 2  # at the end
+
+
+WELDED = """<mujoco><option timestep="0.001"/><worldbody><body name="palm"><freejoint/>
+<geom size=".03" mass=".2"/><site name="grip"/><body name="finger" pos=".05 0 0">
+<joint name="jaw" type="slide" axis="0 1 0" range="0 .04"/><geom size=".01" mass=".02"/></body>
+</body><body name="clamp" pos="0 0 1"><freejoint/><geom size=".01"/></body></worldbody>
+<equality><weld body1="{}"/></equality></mujoco>"""
+
+
+@pytest.mark.parametrize("welded", ["clamp", "palm"])
+def test_a_grip_axis_in_a_scene_with_a_weld_to_the_world(welded: str) -> None:
+    spec = mujoco.MjSpec.from_string(WELDED.format(welded))
+    told = pytest.warns(UserWarning, match="the grip is held fast by a weld")
+    with told if welded == "palm" else nullcontext():
+        scene = hb.load_scene(spec, ("grip", "joint:jaw"))
+    device = Fingers(speed=0.01)
+    grasp = hb.Grasp("grip", device, grip_axis=hb.GripAxis("jaw", 1.0))
+    with hb.Bridge(scene, [grasp], clock=hb.SimulatedClock()) as bridge:
+        assert bridge.run(0.5).verdict == "passive"
+        # the fingers close by 5 mm, against nothing but the finger's mass
+        assert abs(float(bridge.scene.data.joint("jaw").qpos[0])) == pytest.approx(5e-3, abs=1e-3)
 
 
 def test_a_run_is_passive_repeats_to_the_bit_and_notices_a_change(tmp_path: Path) -> None:

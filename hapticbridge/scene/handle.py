@@ -31,6 +31,7 @@ from hapticbridge.kernel.codes import (
     held_joint,
     name_of_hand,
 )
+from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.scene.checks import (
     NOTABLE_OVERLAP,
     Overlap,
@@ -39,7 +40,7 @@ from hapticbridge.scene.checks import (
     listed,
     overlaps,
 )
-from hapticbridge.scene.compile import go_to_start
+from hapticbridge.scene.compile import go_to_start, reset
 from hapticbridge.scene.treatment import SceneChange
 
 # Weld between grip and handle (MuJoCo's equality constraint)
@@ -516,7 +517,9 @@ def take_over_mocap(
     if not fixed:
         return (), []
     data = mujoco.MjData(model)
-    go_to_start(model, data, grip)
+    reset(model, data)
+    with quiet():
+        mujoco.mj_forward(model, data)
     if not held:
         free, kept = (_motions(model, data, grip, without) for without in (fixed, []))
         is_fast = _rank(free) > _rank(kept) == 0
