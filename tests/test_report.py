@@ -572,6 +572,31 @@ def test_a_link_that_turns_faster_than_the_tool_is_named(tmp_path: Path) -> None
     assert cause.remedy == "raise the rate, or turn body 'foot' slower"
 
 
+THROWN = """<mujoco><option gravity="0 0 0"><flag contact="disable"/></option><worldbody>
+<body name="base"><freejoint/><geom size=".0075" mass="2e-4" pos="-.006 0 .002"/>
+<body name="link" pos="0 -.004 .013" euler="24 64 83"><joint type="slide" axis=".98 .48 .16"
+  pos=".009 .009 -.009" stiffness="42" springref="-.1" armature=".007" range="-.0034 .03"/>
+<joint type="ball" pos="-.005 -.008 .003"/><geom type="box" size=".025 .026 .007" pos="0 .01
+  .006" mass=".014" euler="133 155 70"/>
+<body pos=".018 -.059 .072" euler="3 30 60"><joint type="slide" axis=".5 .65 .32" pos="-.01
+  -.009 -.006" frictionloss=".07"/><geom size=".02" mass=".15" pos="0 .009 .01"/><site
+  name="grip" pos="-.003 -.012 .018"/>
+<body euler="67 42 59"><joint type="ball" pos="0 .002 -.003"/><geom type="capsule" size=".023
+  .01" mass=".43" pos=".009 .001 .008"/></body></body></body></body>
+</worldbody></mujoco>"""
+
+
+def test_a_link_that_turns_fast_beside_a_tool_that_does_not_is_named(tmp_path: Path) -> None:
+    # a bent spring throws a light link, which turns on a ball joint, within the first ticks
+    path, scene = tmp_path / "run.mcap", tmp_path / "chain.xml"
+    scene.write_text(THROWN)
+    recorded(path, scene, coupling=hb.Coupling(177.0, 3.1), duration=0.03)
+    report = audit(path)
+    assert report.verdict == "active"
+    cause = cause_of(read_recording(path), report)
+    assert (cause.kind, cause.remedy) == ("rate", "raise the rate, or turn body 'base' slower")
+
+
 @pytest.mark.parametrize(
     ("run", "told"),
     [

@@ -301,7 +301,7 @@ def _runs_in(recording: Recording, window: slice) -> Iterator[Resimulator]:
 # Causes of energy created in the environment
 
 FAST_TURN = 0.02
-"""Rotation of the tool in rad per tick above which its gyroscopic torque is suspected. At 1 kHz, 50
+"""Rotation of a body in rad per tick above which its gyroscopic torque is suspected. At 1 kHz, 50
 rad/s created 0.05 J in a second under a coupling of translation alone (measured). A smaller value
 suspects hands, which turn at 10 rad/s; a larger one misses such cases."""
 
@@ -573,10 +573,9 @@ def _cause_without_contact(
     method, turned = evidence.method, _largest_turn(evidence, window)
     if method.hazard:
         return _method_cause(method, f"{where}; ")
+    body = _faster_body(evidence, report, window, max(2.0 * turned, FAST_TURN))
+    what, turned = body or ("the tool", turned)
     if turned > FAST_TURN:
-        what = "the tool"
-        if body := _faster_body(evidence, report, window, 2.0 * turned):
-            what, turned = body
         return Cause(
             "rate",
             f"{where}; {what} turned by up to {format_number(turned, 2)} rad a tick "
