@@ -182,7 +182,7 @@ def test_robomimic_has_its_groups(runs: list[Path], tmp_path: Path) -> None:
 def test_the_last_next_observation_of_robomimic_is_one_frame_later(
     runs: list[Path], tmp_path: Path
 ) -> None:
-    """Of a run with 1000 ticks per second, 25 frames are 40 ticks apart."""
+    """The run has 1000 ticks per second, and the set 25 frames: 40 ticks lie between two."""
     folder = write_dataset(runs[:1], "robomimic", tmp_path / "set", Shot(fps=25)).folder
     ticks = read_recording(runs[0]).ticks
     with h5py.File(folder / "demos.hdf5") as file:
