@@ -585,6 +585,27 @@ def test_a_duration_without_end_is_refused(call: Called, duration: str) -> None:
     assert "at most 1e+09" in err
 
 
+def test_a_tool_that_its_load_pulls_away_is_told_with_the_load(
+    call: Called, tmp_path: Path
+) -> None:
+    """A weight of 1.2 kg pulls a sliding block by a rope, and the device holds 10 N."""
+    scene = tmp_path / "rope.xml"
+    scene.write_text(
+        """<mujoco><worldbody><site name="ring" pos="0 0 1"/>
+          <body pos="0 0 .5"><joint type="slide"/><geom size=".05" mass="1.2"/><site name="hook"/>
+          </body>
+          <body pos="0 .5 1"><joint type="slide" axis="0 1 0"/><geom size=".05" mass="1"/>
+            <site name="grip"/></body></worldbody>
+          <tendon><spatial range="0 1"><site site="hook"/><site site="ring"/><site site="grip"/>
+          </spatial></tendon></mujoco>"""
+    )
+    code, _, err = call("run", scene, "--fast", "--duration", 2)
+    assert code == 3
+    words = " ".join(err.split())
+    assert "farther from the handle than the stretch limit" in words
+    assert "and of what hangs or lies on it" in words
+
+
 def test_a_load_is_told_as_that_of_the_bodies_that_give_it(call: Called, tmp_path: Path) -> None:
     """A brick of 1 kg falls on a tray of 0.1 kg, and a chain of 0.3 kg hangs from one."""
     scene = tmp_path / "laden.xml"

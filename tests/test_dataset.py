@@ -179,13 +179,28 @@ def test_robomimic_has_its_groups(runs: list[Path], tmp_path: Path) -> None:
             assert demo["dones"][:-1].sum() == 0
 
 
+def test_the_last_next_observation_of_robomimic_is_one_frame_later(
+    runs: list[Path], tmp_path: Path
+) -> None:
+    """The run has 1000 ticks per second, and the set 25 frames: 40 ticks lie between two."""
+    folder = write_dataset(runs[:1], "robomimic", tmp_path / "set", Shot(fps=25)).folder
+    ticks = read_recording(runs[0]).ticks
+    with h5py.File(folder / "demos.hdf5") as file:
+        demo = file["data/demo_0"]
+        ways = demo["next_obs/tool_pose"][-1, :3] - demo["obs/tool_pose"][-1, :3]
+        last = 40 * (demo.attrs["num_samples"] - 1)
+    expected = ticks["tool_position"][last + 40] - ticks["tool_position"][last]
+    assert np.linalg.norm(expected) > 1e-4
+    assert ways == pytest.approx(expected, abs=0.05 * float(np.linalg.norm(expected)))
+
+
 def test_robomimic_gets_the_names_of_all_scenes(tmp_path: Path) -> None:
     """As of three episodes in two scenes of one build; robomimic reads one name for all."""
     values = dict.fromkeys(("action", "observation.state"), np.zeros((5, 13), np.float32))
     writer = RobomimicWriter(tmp_path, Shot(), "push")
     scenes = ["light", "heavy", "light"]
     for number, scene in enumerate(scenes):
-        writer.add(Episode(f"{number}.mcap", scene, values, {}, np.zeros((5, 2)), ()))
+        writer.add(Episode(f"{number}.mcap", scene, values, values, {}, np.zeros((5, 2)), ()))
     writer.finish()
     writer.close()
     with h5py.File(tmp_path / "demos.hdf5") as file:
@@ -211,7 +226,7 @@ def test_rounding_is_no_motion_to_learn(tmp_path: Path, size: float, spread: flo
     actions[:, 1] = np.linspace(0.0, size, 5)
     values = {"action": actions, "observation.state": actions}
     writer = RobomimicWriter(tmp_path, Shot(), "push")
-    writer.add(Episode("run", "scene", values, {}, np.zeros((5, 2)), ()))
+    writer.add(Episode("run", "scene", values, values, {}, np.zeros((5, 2)), ()))
     writer.finish()
     writer.close()
     with h5py.File(tmp_path / "demos.hdf5") as file:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 from typing import Literal
@@ -310,14 +311,33 @@ LOADED = """<mujoco><option gravity="0 0 -10"/><worldbody>
   <equality><weld site1="end" site2="grip"/></equality></mujoco>"""
 
 
+def test_a_weight_on_a_chain_that_diverges_is_told_with_what_pulled_before(tmp_path: Path) -> None:
+    """A weight m that falls into a spring pulls with 2 m g at most."""
+    link = '<body pos=".05 0 0"><joint type="ball" stiffness=".05" damping=".015"/>'
+    link += '<geom type="capsule" fromto="0 0 0 .05 0 0" size=".005"/>'
+    last, tied = link.replace("<body", '<body name="last"'), 'contype="0" conaffinity="0"'
+    text = f"""<mujoco><default><geom {tied}/></default><worldbody>
+      <body><joint type="slide" axis="1 0 0" range="-57 57" damping="1"/>
+        <geom type="box" size=".05 .05 .05" mass="1"/><site name="grip"/>{link * 19}{last}
+        {"</body>" * 20}</body>
+      <body name="load" pos="1.1 0 0"><freejoint/><geom type="box" size=".05 .05 .05" mass="50"/>
+      </body></worldbody>
+      <equality><connect body1="load" body2="last" anchor="-.05 0 0"/></equality></mujoco>"""
+    with hb.Bridge(scene_file(tmp_path, text), clock=hb.SimulatedClock()) as bridge:
+        bridge.run(duration=0.01)
+        (said,) = [each for each in bridge.scene.changes if each.startswith("weight of the tool")]
+    assert "felt → carried, with that of what is tied to it, 'load' (" in said
+    assert re.search(r"pulls with up to (1\.0\d kN|9\d\d N),", said), said
+
+
 def test_parts_welded_to_the_tool_are_carried_with_it_and_loads_on_tendons_are_named(
     tmp_path: Path,
 ) -> None:
     scene = load_scene(scene_file(tmp_path, LOADED))
     scene.carry_tool("asked for")
     assert (
-        "weight of the tool: felt → carried, but not that of 'weight' on its tendons (asked for)"
-        in (scene.changes)
+        "weight of the tool: felt → carried, with that of what is tied to it, 'arm', but not that "
+        "of 'weight' on its tendons (asked for)" in scene.changes
     )
     bodies = "tool", "arm", "weight", "apart"
     assert [float(scene.model.body_gravcomp[scene.model.body(name).id]) for name in bodies] == [

@@ -71,9 +71,10 @@ _REMEDIES = {
         "check the unit (m) and the times (s) of what it reports, and that no sample is late"
     ),
     TripCode.STRETCHED: (
-        "check the motion's unit (m) and speed, the tool's mass (--no-tool-weight carries a tool "
-        "that falls or tips over), and springs, motors or inputs of the scene that push it beyond "
-        "the force limit; with another reach in mind raise --stretch-limit"
+        "check the motion's unit (m) and speed, the weight of the tool (--no-tool-weight carries a "
+        "tool that falls or tips over) and of what hangs or lies on it, and springs, motors or "
+        "inputs of the scene that push it beyond the force limit; with another reach in mind raise "
+        "--stretch-limit"
     ),
     TripCode.TWISTED: (
         "check how fast the hand turns, and springs, motors or inputs of the scene that turn the "

@@ -119,7 +119,7 @@ class Rehearsal:
                 finish(record)
                 work += self.model.nv + data.nefc
                 is_long = work > MAX_WORK and done >= MIN_STEPS
-                if is_long or not np.isfinite(data.qvel).all():
+                if is_long or not np.all(np.abs(data.qvel) <= mujoco.mjMAXVAL):
                     return
                 wrench, forces = np.zeros(6), data.actuator_force[self._outputs]
                 wrench[: len(forces)] = forces

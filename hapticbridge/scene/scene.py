@@ -395,9 +395,15 @@ class Scene:
         self._recompile(self._spec)
         model = self.model
         held = {held_body(model, grip) for grip in (self.grip, *self.other_grips)}
-        trees = [tree for i in held for tree in tied_trees(model, int(model.body_treeid[i]))]
+        own = {int(model.body_treeid[i]) for i in held}
+        trees = sorted(set().union(*(tied_trees(model, tree) for tree in own)))
         model.body_gravcomp[np.isin(model.body_treeid, trees)] = 1.0
         self.is_carried, words = True, "weight of the tool: felt → carried"
+        firsts = [int(model.tree_bodyadr[tree]) for tree in trees if tree not in own]
+        if firsts:
+            more = f" and {len(firsts) - 1} more" if len(firsts) > 1 else ""
+            name = model.body(firsts[0]).name or firsts[0]
+            words += f", with that of what is tied to it, '{name}'{more}"
         if loads := hanging_loads(model, trees):
             words += f", but not that of {choices(loads)} on its tendons"
         self.differences += (SceneChange(words, "weight", reason),)

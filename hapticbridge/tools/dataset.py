@@ -70,9 +70,10 @@ class Episode:
         name: File name of the recording.
         scene: Name of its scene.
         values: Numbers by name, (n, k) float32 each.
+        after: Observations one frame after the last, by name, (1, k) float32 each.
         names: Names of the k numbers, by name.
         states: ``qpos`` and ``qvel`` in a row, (n, nq + nv).
-        pictures: PNG of each frame; none without a camera.
+        pictures: PNG of each frame, and of the one after the last; none without a camera.
         odd: Names of those readings of sensors that the file alone would not give, by the reason.
         repeats: Number of frames that repeat the one before, because deadlines were skipped.
     """
@@ -80,6 +81,7 @@ class Episode:
     name: str
     scene: str
     values: Mapping[str, NDArray[np.float32]]
+    after: Mapping[str, NDArray[np.float32]]
     names: Mapping[str, tuple[str, ...]]
     states: NDArray[np.float64]
     pictures: tuple[bytes, ...] = field(repr=False)
@@ -123,16 +125,16 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
         raise RecordingError(f"'{recording.path}' is shorter than two frames at {shot.fps} Hz")
     axes = axes_of(recording.meta)
     torque = found["rows"]["wrench_on_device"][:, 3:] @ axes.T
-    values = {
-        STATE: np.concatenate([rows["tool_position"], rows["tool_quaternion"]], axis=1)[:-1],
-        ON_HAND: np.concatenate([force_on_hand(rows, axes), torque], axis=1)[:-1],
-        QPOS: found["qpos"][:-1],
-        CTRL: found["ctrl"][:-1],
-        SENSORS: found["sensors"][:-1],
-        ACTION: np.concatenate(
-            [rows["handle_position"], rows["handle_quaternion"], rows["wrench_on_tool"]], axis=1
-        )[1:],
+    observed = {
+        STATE: np.concatenate([rows["tool_position"], rows["tool_quaternion"]], axis=1),
+        ON_HAND: np.concatenate([force_on_hand(rows, axes), torque], axis=1),
+        QPOS: found["qpos"],
+        CTRL: found["ctrl"],
+        SENSORS: found["sensors"],
     }
+    action = np.concatenate(
+        [rows["handle_position"], rows["handle_quaternion"], rows["wrench_on_tool"]], axis=1
+    )[1:]
     names = {
         STATE: POSE,
         ON_HAND: WRENCH,
@@ -145,14 +147,17 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
     if is_posted:
         left_out.append(QPOS)
     for column in left_out:
-        del values[column], names[column]
+        del observed[column], names[column]
+    observed = {key: value.astype(np.float32) for key, value in observed.items()}
     return Episode(
         name=name,
         scene=recording.meta.get("scene", ""),
-        values={key: value.astype(np.float32) for key, value in values.items()},
+        values={key: value[:-1] for key, value in observed.items()}
+        | {ACTION: action.astype(np.float32)},
+        after={key: value[-1:] for key, value in observed.items()},
         names=names,
         states=np.concatenate([found["qpos"], found["qvel"]], axis=1)[:-1],
-        pictures=tuple(found["pictures"][:count]),
+        pictures=tuple(found["pictures"]),
         odd=found["odd_readings"],
         repeats=int(np.sum(np.diff(rows["tick"][:-1]) == 0)),
     )
@@ -221,21 +226,20 @@ class LeRobotWriter:
                 columns[name] = arrow.FixedSizeListArray.from_arrays(columns[name], size)
             self._numbers.setdefault(name, []).append(values)
         looked = np.zeros((0, 3))
-        if episode.pictures:
+        if own := episode.pictures[:count]:
             key = f"observation.images.{_label(self._shot)}"
             pictures = [
-                {"bytes": data, "path": f"frame-{frame:06d}.png"}
-                for frame, data in enumerate(episode.pictures)
+                {"bytes": data, "path": f"frame-{frame:06d}.png"} for frame, data in enumerate(own)
             ]
             kind = arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])
             columns[key] = arrow.array(pictures, kind)
-            looked = _pixels(episode.pictures)
+            looked = _pixels(own)
             self._numbers.setdefault(key, []).append(looked)
         self._features = self._features or self._describe(episode)
         chunk, file = divmod(number, _FILES_PER_CHUNK)
         self._write(_DATA.format(chunk_index=chunk, file_index=file), columns)
         stats = {name: _statistics(values, count) for name, values in numbers.items()}
-        if episode.pictures:
+        if own:
             stats[key] = _of_pictures(_statistics(looked, count))
         self._episodes.append(
             {
@@ -405,15 +409,14 @@ class RobomimicWriter:
         done[-1] = 1.0
         demo["rewards"], demo["dones"] = np.zeros(count), done.astype(np.int64)
         observed: dict[str, NDArray[Any]] = {
-            short: episode.values[name]
+            short: np.concatenate([episode.values[name], episode.after[name]])
             for name, short in _OBSERVATIONS.items()
             if name in episode.values
         }
         if episode.pictures:
             observed[f"{_label(self._shot)}_image"] = _frames(episode.pictures)
         for name, values in observed.items():
-            demo[f"obs/{name}"] = values
-            demo[f"next_obs/{name}"] = np.concatenate([values[1:], values[-1:]])
+            demo[f"obs/{name}"], demo[f"next_obs/{name}"] = values[:-1], values[1:]
         demo.attrs["scene"] = printable(episode.scene)
         self._scenes[episode.scene] = None
         self._actions.append(episode.values[ACTION])
