@@ -41,7 +41,7 @@ SINGLE = 1e-6
 """Largest share by which a device that computes in single precision may pass a limit."""
 
 _ROUNDING = 16 * np.finfo(np.float64).eps
-"""Rounding of a difference of poses, as a share of the places' distance from the origin, and in rad.
+"""Rounding of a difference of poses, in rad, and as a share of the distance from the origin.
 A coupling whose K + B/T is above 1e5 N/m makes more of it than ``TOLERANCE``."""
 
 
