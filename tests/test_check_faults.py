@@ -707,6 +707,15 @@ def test_what_is_advised_for_a_geom_does_not_contradict_itself(tmp_path: Path) -
     assert told == [], "what is advised mends the scene"
 
 
+@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
+def test_a_geom_is_not_of_water_where_the_file_states_the_mass_of_all(tmp_path: Path) -> None:
+    body = '<body name="ball"><freejoint/><geom size="0.02"/><site name="grip"/></body>'
+    for stated, is_told in (('<compiler settotalmass="14"/>', False), ("<compiler/>", True)):
+        (tmp_path / f"{is_told}").mkdir()
+        faults = faults_in(tmp_path / f"{is_told}", mjcf(stated, body=body))
+        assert ("density of water" in kinds(faults)) == is_told
+
+
 def test_mass_is_taken_from_what_is_only_seen_and_not_from_what_collides(tmp_path: Path) -> None:
     body = TWO_KINDS.format(wall="", shell='contype="0" conaffinity="0"', tip="")
     faults = faults_in(tmp_path, mjcf(GOOD_OPTION, body=body.replace('mass="0.05" ', "")))

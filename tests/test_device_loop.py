@@ -153,6 +153,17 @@ def test_a_wrench_along_the_tools_axes_is_told_with_its_cause() -> None:
     assert device.summary["verdict"] == "passive"
 
 
+def test_a_loop_whose_tool_is_a_million_times_as_strong_is_judged(tmp_path: Path) -> None:
+    # K + B/T = 2e8 N/m: a pose rounded in its last digit, 0.1 m × 2.2e-16, is 5e-9 N
+    path = tmp_path / "strong.mcap"
+    with DeviceLoop(
+        "simulated", recording=path, is_simulated=True, scale=2.5, force_scale=1e-6
+    ) as device:
+        followed(device, 0.2)
+    report = audit(path)
+    assert report.verdict == "passive", report.reason
+
+
 def test_a_handle_is_put_where_the_tool_is_put() -> None:
     with DeviceLoop("simulated", is_simulated=True) as device:
         followed(device, 1.0)

@@ -188,6 +188,12 @@ def test_a_callback_of_the_program_is_refused_at_load_and_before_a_run(
     finally:
         clear(None)
     with hb.Bridge(scene, "simulated", clock=hb.SimulatedClock()) as bridge:
+        clear(lambda *_: 0.0)
+        try:
+            with pytest.raises(hb.SceneError, match=f"mjcb_{name}"):
+                bridge.run(0.01)
+        finally:
+            clear(None)
         assert bridge.run(0.01).ticks == 10
 
 

@@ -40,6 +40,10 @@ _FORCE, _TORQUE = slice(0, 3), slice(3, 6)
 SINGLE = 1e-6
 """Largest share by which a device that computes in single precision may pass a limit."""
 
+_ROUNDING = 16 * np.finfo(np.float64).eps
+"""Rounding of a difference of poses, in rad, and as a share of the distance from the origin.
+A coupling whose K + B/T is above 1e5 N/m makes more of it than ``TOLERANCE``."""
+
 
 @dataclass(frozen=True, slots=True)
 class AuditedBlock:
@@ -145,9 +149,13 @@ def wrench_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviat
         law = wrench_by_law(ticks, gains, parameters, block.motion)
         for part, spring in zip((_FORCE, _TORQUE), springs(gains, parameters), strict=True):
             law[:, part] = spring.limited(law[:, part])
-        yield Deviation.between(
+        deviation = Deviation.between(
             "wrench_on_tool", ticks["wrench_on_tool"], law, "N or N m", "coupling law and poses"
         )
+        k, b, k_r, b_r = gains.T
+        places = np.abs(ticks["handle_position"]).max(axis=1)
+        rounded = places * (k + b / parameters.period) + k_r + b_r / parameters.period
+        yield deviation._replace(allowed=deviation.allowed + _ROUNDING * rounded)
     lever, before, fade = ticks["lever"], block.lever_before, parameters.guarding.fade_ticks
     highest = np.minimum(before + 1 / (block.rise_ticks + 1), 1.0)
     lowest = np.maximum(before - 1 / fade, 0.0)

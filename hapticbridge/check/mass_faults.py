@@ -57,6 +57,8 @@ def _default_densities(case: SceneUnderCheck) -> Iterator[Fault]:
     model, geoms = case.model, list(case.source.spec.geoms)
     if len(geoms) != model.ngeom:  # the compiler dropped some, so ids do not match
         return
+    if case.source.spec.compiler.settotalmass > 0:  # the file states the mass of all together
+        return
     silent: dict[int, list[int]] = {}
     for geom, written in enumerate(geoms):
         body = int(model.geom_bodyid[geom])

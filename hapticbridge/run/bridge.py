@@ -55,6 +55,7 @@ from hapticbridge.run.request import RunRequest
 from hapticbridge.run.session import Session, StopRequest
 from hapticbridge.run.summary import Ledger, Summary
 from hapticbridge.scene import Scene, load_scene
+from hapticbridge.scene.checks import refuse_callbacks
 from hapticbridge.scene.compile import clause
 from hapticbridge.scene.inputs import Write, input_writes
 from hapticbridge.signals import stopping_on_signals
@@ -232,9 +233,11 @@ class Bridge:
         Raises:
             SafetyTrip: The guard stopped the run, or the device failed. Zero force was commanded
                 first, where it still could be.
-            HapticBridgeError: The bridge is not open, or the duration is out of range.
+            HapticBridgeError: The bridge is not open, a callback of MuJoCo is set, or the duration
+                is out of range.
         """
         session, trip = self._open_session(), None
+        refuse_callbacks()
         session.begin(duration)
         with ExitStack() as stack:
             stack.callback(session.note_stop)

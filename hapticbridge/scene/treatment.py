@@ -200,7 +200,7 @@ TREATMENTS: dict[str, Treatment] = {
     ),
     "start": Treatment(
         "key", "qpos", "changed", "moved onto limits, equality constraints and contacts",
-        "rigid ones would hold the violation",
+        "rigid ones would hold the violation, and soft ones release its energy",
     ),
     "only keyframe": Treatment(
         "key", "name", "changed", "the start, if it is the only one, at rest and has no name",
