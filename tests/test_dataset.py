@@ -22,7 +22,7 @@ import hapticbridge as hb
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.recording import read_recording
 from hapticbridge.replay.film import Shot
-from hapticbridge.tools.dataset import Episode, RobomimicWriter, write_dataset
+from hapticbridge.tools.dataset import Episode, RobomimicWriter, continued, write_dataset
 
 pq: Any = importlib.import_module("pyarrow.parquet")
 
@@ -177,6 +177,27 @@ def test_robomimic_has_its_groups(runs: list[Path], tmp_path: Path) -> None:
             np.testing.assert_array_equal(demo["next_obs/qpos"][:-1], demo["obs/qpos"][1:])
             assert demo["dones"][-1] == 1
             assert demo["dones"][:-1].sum() == 0
+
+
+def test_the_quaternion_of_a_turning_tool_does_not_jump_in_a_data_set(tmp_path: Path) -> None:
+    half = np.linspace(0.0, 2.5 * np.pi, 61)  # half of the angle: two turns and a half
+    smooth = np.stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half], axis=1)
+    stored = smooth * np.where(smooth[:, :1] < 0.0, -1.0, 1.0)
+    assert np.abs(np.diff(stored, axis=0)).max() > 1.9
+    assert np.allclose(continued(stored), smooth)
+    motion, run = tmp_path / "turn.csv", tmp_path / "run.mcap"
+    times = np.linspace(0.0, 2.0, 61)
+    turns = 0.3 * half  # half of 270 deg
+    rows = [(t, 0, 0, 0, np.cos(a), 0, 0, np.sin(a)) for t, a in zip(times, turns, strict=True)]
+    header = "t,x,y,z,qw,qx,qy,qz\n"
+    motion.write_text(header + "\n".join(",".join(map(str, row)) for row in rows))
+    recorded(run, "point_mass", f"trajectory:{motion}")
+    folder = write_dataset([run], "robomimic", tmp_path / "set").folder
+    with h5py.File(folder / "demos.hdf5") as file:
+        turned = np.asarray(file["data/demo_0/obs/tool_pose"])[:, 3:]
+    assert np.abs(np.diff(read_recording(run).ticks["tool_quaternion"], axis=0)).max() > 1.9
+    assert np.abs(np.diff(turned, axis=0)).max() < 0.2
+    assert turned[-1, 0] == pytest.approx(np.cos(turns[-1]), abs=0.05)  # and not its opposite
 
 
 def test_the_last_next_observation_of_robomimic_is_one_frame_later(

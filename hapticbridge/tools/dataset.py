@@ -126,15 +126,14 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
     axes = axes_of(recording.meta)
     torque = found["rows"]["wrench_on_device"][:, 3:] @ axes.T
     observed = {
-        STATE: np.concatenate([rows["tool_position"], rows["tool_quaternion"]], axis=1),
+        STATE: np.concatenate([rows["tool_position"], continued(rows["tool_quaternion"])], axis=1),
         ON_HAND: np.concatenate([force_on_hand(rows, axes), torque], axis=1),
         QPOS: found["qpos"],
         CTRL: found["ctrl"],
         SENSORS: found["sensors"],
     }
-    action = np.concatenate(
-        [rows["handle_position"], rows["handle_quaternion"], rows["wrench_on_tool"]], axis=1
-    )[1:]
+    turned = continued(rows["handle_quaternion"])
+    action = np.concatenate([rows["handle_position"], turned, rows["wrench_on_tool"]], axis=1)[1:]
     names = {
         STATE: POSE,
         ON_HAND: WRENCH,
@@ -161,6 +160,19 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
         odd=found["odd_readings"],
         repeats=int(np.sum(np.diff(rows["tick"][:-1]) == 0)),
     )
+
+
+def continued(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the same rotations, each with the sign of q or −q that is nearer to the last one.
+
+    The sign of a recording's jumps at half a turn, which a learner would take for a motion.
+
+    Args:
+        quaternions: Unit quaternions (w, x, y, z), (n, 4).
+    """
+    is_turned = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
+    signs = np.cumprod(np.where(is_turned, -1.0, 1.0))
+    return np.concatenate([quaternions[:1], signs[:, None] * quaternions[1:]])
 
 
 class Writer(Protocol):
