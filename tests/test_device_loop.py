@@ -349,6 +349,22 @@ with hapticbridge.DeviceLoop("simulated", recording={str(path)!r}) as device:
     assert (last["event"], last["reason"]) == ("stop", "program that was killed")
 
 
+def test_a_loop_ends_with_the_program_that_was_killed_while_the_loop_started() -> None:
+    script = """
+import os
+from hapticbridge.cli.main import main
+from hapticbridge.run.endpoint import Endpoint
+parents, own = [4242], Endpoint.open
+os.getppid = lambda: parents[-1]
+Endpoint.open = lambda *arguments: (parents.append(1), own(*arguments))[1]
+main(["serve", "simulated", "--json"])
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert "program that was killed" in told.stdout
+
+
 def test_the_recording_tells_how_the_program_left(tmp_path: Path) -> None:
     for error, reason in ((None, "program"), (KeyError("its own"), "program that failed")):
         path = tmp_path / "run.mcap"

@@ -106,6 +106,7 @@ class Serve:
 
     def execute(self) -> int:
         """Runs the loop; returns the exit code."""
+        parent = os.getppid()  # later it is another, if the program was killed in between
         refuse_overwriting(self.record, self.device, overwrite=self.overwrite)
         clock = GrantedClock() if self.fast else RealClock()
         refuse_simulated_time(self.device, clock)
@@ -150,7 +151,7 @@ class Serve:
             endpoint.open(bridge)
             if self.as_json:
                 leave = partial(self._on_leave(bridge, clock), GONE)
-                Thread(target=_watch_parent, args=(os.getppid(), leave), daemon=True).start()
+                Thread(target=_watch_parent, args=(parent, leave), daemon=True).start()
             self._tell(endpoint, token)
             error: BaseException | None = None
             try:
