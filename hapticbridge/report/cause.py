@@ -410,8 +410,10 @@ def _hardest_pump(
 
     def given(data: mujoco.MjData) -> dict[Pump, float]:
         met = data.contact.geom.tolist()
-        joined = {pump: may_move(pump, data, grips, met) for pump in powers(data)}
-        return {pump: power * joined[pump] for pump, power in powers(data).items()}
+        return {
+            pump: power if may_move(pump, data, grips, met) else 0.0  # it may be infinite
+            for pump, power in powers(data).items()
+        }
 
     works = _works(recording, model, window, given)
     pump = max(works, key=lambda each: works[each], default=None)

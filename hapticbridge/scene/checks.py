@@ -555,14 +555,10 @@ def check_model(model: mujoco.MjModel, grip: str) -> None:
     chain = ancestors(model, held_body(model, grip))
     if not any(model.body_dofnum[body_id] for body_id in chain):
         is_mocap = any(model.body_mocapid[body_id] >= 0 for body_id in chain)
-        where = (
-            "with a free joint in the place of mocap"
-            if is_mocap
-            else ("with a free joint or at the end of joints")
-        )
+        where = "in the place of mocap" if is_mocap else "or at the end of joints"
         raise SceneError(
             f"grip '{grip}' sits on {_body_name(model, chain[0])}, which cannot move; put it on a "
-            f"body {where}"
+            f"body with a free joint {where}"
         )
     for name in COUPLING_ACTUATORS:
         _check_coupling_actuator(model, name)
