@@ -204,16 +204,3 @@ def test_what_mujoco_cannot_split_or_would_reset_is_a_whole_step() -> None:
             numbers[1] = before
     data.qvel[1] = 0.99e10
     assert is_sound(state)
-
-
-def test_a_control_callback_is_called_once_a_tick(calls: list[str]) -> None:
-    """MuJoCo calls it between the halves of a whole step; ``mj_step2`` alone would leave it out."""
-    seen: list[Any] = []
-    with fast("point_mass", ScriptedDevice(sway), pipelined=True) as bridge:
-        calls.clear()
-        mujoco.set_mjcb_control(lambda model, _data: seen.append(model))
-        try:
-            bridge.run(0.1)
-        finally:
-            mujoco.set_mjcb_control(None)
-    assert len(seen) == calls.count("mj_step1") == 100

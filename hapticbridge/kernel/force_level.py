@@ -78,8 +78,8 @@ LEVEL_DTYPE = np.dtype(
 the tool in N and N m, ``gain_ratio`` c of the present gains, ``previous`` c of the previous tick,
 ``compliance`` σ; ``tried`` c of the previous repetition in the step and ``length`` its ‖u‖;
 ``wanted`` c of the next repetition and ``new_length`` the present ‖u‖.
-``is_solved`` is 1 if steps are repeated, and ``reads_poses`` if sensors, plugins or a callback read
-the bodies' poses then; ``repetitions`` counts repetitions since the start; ``state_before`` is the
+``is_solved`` is 1 if steps are repeated, and ``reads_poses`` if sensors or plugins read the bodies'
+poses then; ``repetitions`` counts repetitions since the start; ``state_before`` is the
 address of MuJoCo's state before the step."""
 
 
@@ -97,9 +97,7 @@ def bind_level(
     level["level"] = levels
     level["gain_ratio"] = level["previous"] = 1.0
     level["is_solved"] = is_solved
-    level["reads_poses"] = (
-        model.nsensor > 0 or model.nplugin > 0 or mujoco.get_mjcb_control() is not None
-    )
+    level["reads_poses"] = model.nsensor > 0 or model.nplugin > 0
     before = np.zeros(model.nq + model.nv + model.na + model.nhistory + 1)
     level["state_before"] = before.ctypes.data
     return {"state_before": before}

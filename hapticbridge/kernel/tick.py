@@ -378,7 +378,7 @@ def can_split(model: mujoco.MjModel, scheme: int) -> bool:
 
     It may not with a weld to the handle, whose constraint rows change with its pose; with a tool
     that is placed at the handle; under RK4, which evaluates all stages four times; and with a
-    plugin or a callback for the controls, which may read any number.
+    plugin, which may read any number.
 
     Args:
         model: The prepared scene.
@@ -388,7 +388,6 @@ def can_split(model: mujoco.MjModel, scheme: int) -> bool:
         Scheme(scheme).properties.may_split
         and model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
         and model.nplugin == 0
-        and mujoco.get_mjcb_control() is None
     )
 
 
