@@ -70,6 +70,16 @@ def test_what_only_a_hand_gives_an_effect_is_refused_without_one(
     assert call(*command)[0] == 0
 
 
+def test_a_motion_of_a_file_has_no_button_to_hold(call: Called, tmp_path: Path) -> None:
+    """The tool would wait for ever for its dead-man button."""
+    motion = tmp_path / "hand.csv"
+    motion.write_text("t,x,y,z\n0,0,0,0\n1,0.001,0,0\n")
+    command = ("run", "peg_in_hole", "--device", f"trajectory:{motion}", "--fast")
+    code, _, err = call(*command, "--dead-man", 0)
+    assert code == 2
+    assert "dead-man is button 0, and the device 'trajectory' has none" in " ".join(err.split())
+
+
 FELT_WRONG = """<mujoco>
   <compiler angle="degree"/>
   <worldbody>

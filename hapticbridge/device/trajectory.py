@@ -294,6 +294,7 @@ class TrajectoryDevice:
         self.info = _prescribed(
             duration=motion.duration,
             rate=None,
+            buttons=0,
             force_limit=force_limit,
             torque_limit=torque_limit,
             speed_limit=speed_limit,

@@ -497,9 +497,10 @@ def _refuse_buttons(options: BridgeOptions, info: DeviceInfo, *, is_recorded: bo
     for name in ("clutch", "dead_man", "mark"):
         button = getattr(options, name)
         if button is not None and info.buttons is not None and button >= info.buttons:
+            known = f"{format_count(info.buttons, 'button')}, numbered from 0"
             raise DeviceError(
                 f"{name.replace('_', '-')} is button {button}, and the device '{info.name}' "
-                f"has {format_count(info.buttons, 'button')}, numbered from 0"
+                f"has {known if info.buttons else 'none'}"
             )
 
 
