@@ -125,7 +125,7 @@ def active_by_quantisation(folder: Path) -> Path:
 
 def active_by_mocap(folder: Path) -> Path:
     """A body that is put elsewhere tick by tick and knocks against a tool at rest."""
-    path, device = folder / "push.mcap", ScriptedDevice(_resting)
+    path, device = folder / "push.mcap", ScriptedDevice(resting)
     options = {"duration": 0.05, "on_tick": _knock("pusher"), "contact": "scene"}
     return made_in(path, PUSHED, device, LOOSE, **options)
 
@@ -178,7 +178,7 @@ class LossyDevice(SimulatedDevice):
         return 0
 
 
-def _resting(_: int) -> tuple[float, ...]:
+def resting(_: int) -> tuple[float, ...]:
     return (0, 0, 0, 1, 0, 0, 0)
 
 

@@ -824,6 +824,30 @@ def test_what_a_run_changes_by_itself_and_a_motor_that_pushes_are_notes(tmp_path
         ] == ([True] * len(told))
 
 
+@pytest.mark.parametrize(
+    ("joint", "gear", "told"),
+    [
+        ("free", "0 2 0 0 0 0", "6 N"),
+        ("free", "0 0 0 0 0 2", "6 N m"),
+        ("ball", "0 2 0", "6 N m"),
+        ("hinge", "2", "6 N m"),
+        ("slide", "2", "6 N"),
+    ],
+)
+def test_the_unit_of_a_motor_is_that_of_what_it_drives(
+    joint: str, gear: str, told: str, tmp_path: Path
+) -> None:
+    """A control of 3 times a gear of 2."""
+    body = f'<body name="tool"><joint name="j" type="{joint}"/><geom size="0.01" mass="0.1"/>'
+    motor = (
+        f'<actuator><motor name="m" joint="j" gear="{gear}"/></actuator>'
+        '<keyframe><key name="home" ctrl="3"/></keyframe>'
+    )
+    text = mjcf(motor, body=body + '<site name="grip"/></body>')
+    notes = [fault.sentence for fault in faults_in(tmp_path, text, STILL) if fault.kind == "motor"]
+    assert notes and f"pushes joint 'j' with {told} from" in notes[0]
+
+
 def test_what_a_motor_holds_against_gravity_is_not_told_but_what_it_pushes_beyond_is(
     tmp_path: Path,
 ) -> None:

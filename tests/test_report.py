@@ -420,6 +420,35 @@ def test_what_did_no_work_is_no_cause(old: str, new: str, tmp_path: Path) -> Non
     assert (cause.kind, "bounces (e = 0.61)" in cause.evidence) == ("contact setting", True)
 
 
+TOWED = f"""<mujoco><option timestep="0.001"/><worldbody><geom {PLATE} {HARD}/>
+<body pos="0 0.5 0.025"><freejoint/><geom type="box" size=".025 .025 .025" mass="0.1"/></body>
+<body pos="-0.06 0 0.1"><freejoint/><geom size="0.02" mass="0.1"/><site name="grip"/></body>
+<body name="towed" pos="0.06 0 0.1"><freejoint/><geom size="0.02" mass="0.1"/></body>
+<body name="tug" mocap="true" pos="0.06 0 0.1"/></worldbody>
+<equality><weld body1="tug" body2="towed" solref="0.02 1"/></equality></mujoco>"""
+"""A body that is welded to a moved one, and a box that lies on a hard floor beside them."""
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_box_at_rest_is_not_blamed_for_a_weld_that_was_moved(tmp_path: Path) -> None:
+    """Tug and towed body touch nothing; without the moves the run is passive."""
+
+    def towed(ticks: set[int]) -> AuditReport:
+        def tow(bridge: Bridge, tick: int) -> None:
+            if tick in ticks:
+                way = 1e-4 * tick
+                bridge.set_input(mocap={"tug": (0.06 - way, 0.0, 0.1 - way, 1, 0, 0, 0)})
+
+        path, device = tmp_path / f"{len(ticks)}.mcap", ScriptedDevice(report_runs.resting)
+        options = {"duration": 0.05, "contact": "scene", "on_tick": tow}
+        report_runs.made_in(path, TOWED, device, report_runs.LOOSE, **options)
+        return audit(path)
+
+    report = towed({10, 20})
+    cause = cause_of(read_recording(report.path), report)
+    assert (towed(set()).verdict, cause.kind) == ("passive", "inputs"), cause
+
+
 FAST_HAND = """<mujoco><option gravity="0 0 0"/><worldbody>
 <body><joint name="rail" type="slide" axis="{}"/><geom size="0.02" mass="2"/>
 <site name="grip"/></body>

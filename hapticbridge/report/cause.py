@@ -31,7 +31,7 @@ from hapticbridge.report.evidence import Evidence
 from hapticbridge.scene.checks import PUMPING, Pump, may_move, pump_powers, unmetered_work
 from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
 from hapticbridge.scene.fault import weight
-from hapticbridge.scene.handle import constraint_rows
+from hapticbridge.scene.handle import constraint_rows, mocap_of
 from hapticbridge.scene.physics import (
     STEADY_WAY,
     TendonWatch,
@@ -640,11 +640,9 @@ def _concerns(evidence: Evidence, pairs: Pairs | None) -> list[Concern]:
 
 
 def _can_push(evidence: Evidence, pairs: Pairs | None, share: float) -> bool:
-    """Returns True if a mocap body held or touched anything while the energy was created."""
+    """Returns True if a mocap body was tied to or touched anything while energy was created."""
     model = evidence.model
-    if model is None:
-        return True
-    if model.neq and share < MOST:  # a weld pulls without contact
+    if model is None or any(mocap_of(model, i) for i in np.flatnonzero(model.eq_active0).tolist()):
         return True
     if share < MOST or pairs is None:
         return share >= MOST

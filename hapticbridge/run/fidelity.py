@@ -95,7 +95,7 @@ class Cause(Enum):
     CONTACT = "rigid contacts in place of the file's own"
     DIAGONAL = "flag diagexact, which rigid contacts need"
     LOAD = "what is changed in the scene as it is loaded"
-    OPTIONS = "the integrator and the solver's options"
+    OPTIONS = "the integrator or the solver's options"
 
 
 class Places(NamedTuple):

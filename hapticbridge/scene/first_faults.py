@@ -89,15 +89,15 @@ def _motor_force(model: mujoco.MjModel, data: mujoco.MjData, actuator: int) -> t
     output, driven = _output(model, actuator), int(model.actuator_trnid[actuator, 0])
     gear, force = model.actuator_gear[output], abs(float(data.actuator_force[output]))
     kind = int(model.actuator_trntype[actuator])
-    if kind in OF_A_JOINT:
-        is_slide = model.jnt_type[driven] == mujoco.mjtJoint.mjJNT_SLIDE
-        return force * float(np.linalg.norm(gear)), "N" if is_slide else "N m"
-    if kind == mujoco.mjtTrn.mjTRN_SITE:
+    joint = model.jnt_type[driven] if kind in OF_A_JOINT else None
+    if joint == mujoco.mjtJoint.mjJNT_BALL:
+        return force * float(np.linalg.norm(gear[:3])), "N m"
+    if joint == mujoco.mjtJoint.mjJNT_FREE or kind == mujoco.mjtTrn.mjTRN_SITE:
         is_force = bool(np.any(gear[:3]))
         return force * float(np.linalg.norm(gear[:3] if is_force else gear[3:])), (
             "N" if is_force else "N m"
         )
-    return force * abs(float(gear[0])), "N"
+    return force * abs(float(gear[0])), "N m" if joint == mujoco.mjtJoint.mjJNT_HINGE else "N"
 
 
 def _motor_change(

@@ -511,7 +511,7 @@ def take_over_mocap(
         SceneError: A change is needed that ``as_is`` forbids.
     """
     active = np.flatnonzero(model.eq_active0).tolist()
-    held = [i for i in active if _mocap_of(model, i)]
+    held = [i for i in active if mocap_of(model, i)]
     # a body without a tree is fixed, or a mocap body
     fixed = [i for i in active if -1 in model.body_treeid[list(_tied_bodies(model, i))]]
     if not fixed:
@@ -533,7 +533,7 @@ def take_over_mocap(
     if not held:
         return (), []
     more = f" and {len(held) - 1} more" if len(held) > 1 else ""
-    name = _mocap_of(model, held[0])
+    name = mocap_of(model, held[0])
     if not is_held:
         part = f"{_rank(kept)} of {_rank(free)} of its motions"
         return (), [f"mocap body '{name}'{more} holds the tool and leaves the grip {part}"]
@@ -593,7 +593,7 @@ def _tied_bodies(model: mujoco.MjModel, equality: int) -> tuple[int, ...]:
     return tuple(sides.tolist())
 
 
-def _mocap_of(model: mujoco.MjModel, equality: int) -> str:
+def mocap_of(model: mujoco.MjModel, equality: int) -> str:
     """Returns the mocap body, or its number, that a weld or connect ties to; empty without one."""
     roots = (int(model.body_rootid[body]) for body in _tied_bodies(model, equality))
     names = (model.body(i).name or str(i) for i in roots if model.body_mocapid[i] >= 0)
