@@ -736,6 +736,13 @@ def test_a_tool_whose_inertia_is_refused_has_no_centre_that_the_grip_is_far_from
     assert found & {"missing inertia", "far grip"} == {expected}
 
 
+def test_a_tool_without_geoms_has_no_size_that_its_grip_is_far_from(tmp_path: Path) -> None:
+    body = """<body name="tool" pos="0 0.7 0"><freejoint/>
+        <inertial mass="0.1" pos="0 0 0" diaginertia="1e-4 1e-4 1e-4"/>
+        <site name="grip" pos="0 0 0.05"/></body>"""
+    assert "far grip" not in kinds(faults_in(tmp_path, mjcf(GOOD_OPTION, body=body), STILL))
+
+
 @pytest.mark.parametrize(
     ("joints", "is_told"),
     [

@@ -318,3 +318,16 @@ def test_a_squeeze_is_not_felt_by_the_hand_that_holds_the_pliers(squeezed: Squee
     assert np.abs(squeezed.fingers["wrench_on_device"][squeeze, 0]).max() > 5.0
     # 5 N between the fingers are internal; the hand bears the inertia of 0.1 kg
     assert np.abs(squeezed.hand["wrench_on_device"][squeeze, :3]).max() < 0.05
+
+
+def test_the_command_tells_of_a_grip_axis_that_moves_no_joint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = tmp_path / "tongs.xml"
+    scene.write_text(TONGS)
+    monkeypatch.setattr("hapticbridge.cli.run.device_for", lambda *_: Fingers())
+    run = ["run", str(scene), "--fast", "--duration", "0.05", "--grip", "left"]
+    told = "the grip axis of 'hand' moves no joint; --grip-axis names one"
+    for chosen, is_told in ([], True), (["--grip-axis", "none"], False):
+        assert main([*run, *chosen]) in (0, 1)
+        assert (told in capsys.readouterr().err) is is_told

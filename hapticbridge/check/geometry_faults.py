@@ -103,12 +103,13 @@ def grip_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         yield Fault("held grip", case.places.find("site", site), clause, LET_GO)
     tool_bodies, body = case.tool_bodies, int(model.site_bodyid[site])
     mass = model.body_mass[tool_bodies]
-    if not mass.sum() > 0 or tool_bodies[list(case.refused)].any():
-        return  # it has no centre, and another fault says so
+    size = float(np.linalg.norm(tool_extent(case)))
+    if not mass.sum() > 0 or not size or tool_bodies[list(case.refused)].any():
+        return  # it has no centre, and another fault says so, or no geom to be far from
     centre = mass @ scene.data.xipos[tool_bodies] / mass.sum()
     grip = scene.data.site_xpos[site]
     distance = float(np.linalg.norm(grip - centre))
-    extent = max(float(np.linalg.norm(tool_extent(case))), _MIN_EXTENT)
+    extent = max(size, _MIN_EXTENT)
     if distance <= FARTHEST_GRIP * extent or not _is_turned_by_pushes(model, scene.data, site):
         return
     rotation = scene.data.xmat[body].reshape(3, 3)

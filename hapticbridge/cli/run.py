@@ -518,6 +518,10 @@ class Run:
             stack.callback(checked(device).close)
             refuse_without_hand(self.options, [device.info])
             chosen = self._for_devices([device.info])
+            if device.info.grip_axis is not None and not joint and self.grip_axis is None:
+                notify(
+                    f"the grip axis of '{device.info.name}' moves no joint; --grip-axis names one"
+                )
             if joint and self.grip_axis is None and device.info.grip_axis is None:
                 notify(f"'{device.info.name}' has no grip axis, so joint '{joint}' moves freely")
             elif joint:
