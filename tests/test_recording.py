@@ -601,6 +601,19 @@ def test_damaged_length_loses_no_later_chunk(whole: Path, tmp_path: Path) -> Non
     assert 1000 < ticks.size < 1300
 
 
+def test_damage_that_leaves_no_tick_is_the_reason_and_no_foreign_file(
+    whole: Path, tmp_path: Path
+) -> None:
+    data, first = bytearray(whole.read_bytes()), chunks(whole)[0][0]
+    del data[first + 500 : first + 1012]  # all that follows stands elsewhere
+    with pytest.raises(RecordingError) as refusal:
+        changed(tmp_path / "run.mcap", data)
+    told = str(refusal.value).removeprefix(f"{tmp_path / 'run.mcap'} ")
+    assert told.startswith("is damaged, and none of its ticks can be read: the index at the end")
+    assert "nothing can be read from byte" in told
+    assert "no topic" not in told
+
+
 def test_chunk_that_claims_exabytes_is_not_allocated(whole: Path, tmp_path: Path) -> None:
     data = bytearray(whole.read_bytes())
     struct.pack_into("<Q", data, chunks(whole)[0][0] + 9 + 16, 1 << 60)
