@@ -108,6 +108,20 @@ def test_messages_without_stamps_have_the_times_of_the_log(tmp_path: Path) -> No
     np.testing.assert_allclose(read_bag(file).table[:, 0], [0, 0.01, 0.02], atol=1e-12)
 
 
+def test_a_message_that_damage_hides_is_missed(tmp_path: Path) -> None:
+    """Its record is of an unknown kind then, which is skipped, and the file has no checksum."""
+    path = tmp_path / "hand.mcap"
+    with path.open("wb") as file:
+        write_ramp(McapWriter(file, compression=CompressionType.NONE, enable_crcs=False))
+    data = bytearray(path.read_bytes())
+    message = data.index(ramp()[3][1]) - 31  # kind, length, channel, sequence and two times
+    assert data[message] == Opcode.MESSAGE
+    data[message] |= 0x40
+    path.write_bytes(data)
+    with pytest.raises(DeviceError, match="index counts 5 messages of /hand, and 4 can be read"):
+        read_bag(path)
+
+
 @pytest.mark.parametrize("unset", [[0], [0, 1], [3]])
 def test_some_messages_without_stamps_are_told_and_a_simulated_clock_from_0_is_not(
     tmp_path: Path, unset: list[int]
