@@ -523,6 +523,17 @@ def test_zeros_behind_the_last_record_are_a_cut(whole: Path, tmp_path: Path) -> 
     assert "nothing can be read from byte" in problem
 
 
+def test_zeros_for_the_rest_of_the_last_chunk_are_a_cut(whole: Path, tmp_path: Path) -> None:
+    """A file system that lost power knows a file's length, and not all that was written."""
+    content, (start, end, _) = whole.read_bytes(), chunks(whole)[2]
+    before = changed(tmp_path / "kept.mcap", content[:start]).ticks
+    for first in (*range(start + 1, start + 60), (start + end) // 2, end - 2):
+        zeros = bytes(end - first + 5000)
+        recording = changed(tmp_path / "cut.mcap", content[:first] + zeros)
+        assert (recording.is_cut, recording.problems) == (True, ()), first - start
+        assert recording.ticks.tobytes() == before.tobytes()
+
+
 @pytest.mark.parametrize("copies", [0, 1])
 def test_bytes_behind_a_whole_file_are_damage_and_no_cut(
     copies: int, whole: Path, tmp_path: Path
