@@ -177,9 +177,9 @@ def test_text_of_another_encoding_is_named_as_that(encoding: str, tmp_path: Path
 def test_a_button_of_a_motion_without_buttons_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "hand.csv"
     file.write_text(GOOD)
-    for button in ("clutch", "dead_man"):
+    for options in (hb.BridgeOptions(clutch=0), hb.BridgeOptions(dead_man=0)):
         with pytest.raises(DeviceError, match="'trajectory' has 0 buttons"):
-            hb.Bridge("point_mass", f"trajectory:{file}", **{button: 0})
+            hb.Bridge("point_mass", f"trajectory:{file}", options=options)
 
 
 def test_no_text_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
