@@ -476,6 +476,8 @@ MISTAKEN = [
     (table(1e9, 1e3), r"rows 10000000 s apart, as times in ns have; .* if these are mm"),
     ("t_ms,x,y,z\n0,0,0,0\n1,0,0,0\n", "'t_ms' looks like ms; .* name the column t"),
     ("t,x_mm,y_mm,z_mm\n0,0,0,0\n1,0,0,0\n", "'x_mm' looks like mm; .* name the column x"),
+    ("t [s],x [mm],y [mm]\n", r"'x \[mm\]' looks like mm; .* name the column x"),
+    ("t (ms),x,y,z\n", r"'t \(ms\)' looks like ms; .* name the column t"),
 ]
 
 

@@ -259,10 +259,10 @@ def _column_names(where: str, line: str, fields: list[str]) -> list[str]:
     if set(EXPORTED) <= set(names):
         own = dict(zip(EXPORTED, known, strict=True))
         return [own.get(name, "") for name in names]
-    if scaled := next((name for name in names if name.endswith(("ms", "mm"))), ""):
+    if scaled := next(filter(None, (re.search(r"(ms|mm)\W*$", name) for name in names)), None):
         raise DeviceError(
-            f"{where}: column {scaled!r:.40} looks like {scaled[-2:]}; times are in s and "
-            f"positions in m: divide by 1000, and name the column {scaled[0]}"
+            f"{where}: column {scaled.string!r:.40} looks like {scaled[1]}; times are in s and "
+            f"positions in m: divide by 1000, and name the column {scaled.string[0]}"
         )
     if missing := [name for name in TIME_AND_POSITION if name not in names]:
         raise DeviceError(f"{where}: column {', '.join(missing)} is missing; {needed}")
