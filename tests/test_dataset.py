@@ -285,6 +285,19 @@ def test_what_cannot_be_learned_from_is_refused_and_leaves_nothing(
     assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap", "other.mcap", "set"]
 
 
+@pytest.mark.parametrize("form", ["lerobot", "robomimic"])
+def test_recordings_of_two_grips_are_no_data_set(form: str, tmp_path: Path) -> None:
+    """The state would be the bolt's pose in one episode, and the wrench's in the other."""
+    files = [tmp_path / f"{grip}.mcap" for grip in ("bolt", "wrench")]
+    for file in files:
+        scene = hb.load_scene("nut_and_wrench", grip=file.stem)
+        with hb.Bridge(scene, clock=hb.SimulatedClock(), recording=file) as bridge:
+            bridge.run(duration=0.1)
+    with pytest.raises(RecordingError, match="are of the grips 'bolt', 'wrench'; the poses"):
+        write_dataset(files, form, tmp_path / "set")
+    assert not (tmp_path / "set").exists()
+
+
 @pytest.mark.parametrize(
     ("options", "fps", "most"),
     [({"rate": 25.0}, 26, 25), ({"scene_rate": 20.0}, 30, 20), ({"rate": 60.0}, 61, 60)],

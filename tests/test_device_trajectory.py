@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+import hapticbridge as hb
 from hapticbridge.device import Motion, ReplayDevice, TrajectoryDevice, open_device, read_motion
 from hapticbridge.device.base import Device
 from hapticbridge.errors import DeviceError, RecordingError
@@ -162,6 +163,23 @@ def test_bad_files_are_refused_with_name_and_line(tmp_path: Path, text: str, wor
     assert str(file) in str(error.value)
     assert words in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be", "utf-32", "utf-32-be"])
+def test_text_of_another_encoding_is_named_as_that(encoding: str, tmp_path: Path) -> None:
+    """Its columns are there, and separated by commas."""
+    file = tmp_path / "hand.csv"
+    file.write_bytes(GOOD.encode(encoding))
+    with pytest.raises(DeviceError, match=r"line 1: holds a NUL .* write the table in UTF-8"):
+        read_motion(file)
+
+
+def test_a_button_of_a_motion_without_buttons_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "hand.csv"
+    file.write_text(GOOD)
+    for options in (hb.BridgeOptions(clutch=0), hb.BridgeOptions(dead_man=0)):
+        with pytest.raises(DeviceError, match="'trajectory' has 0 buttons"):
+            hb.Bridge("point_mass", f"trajectory:{file}", options=options)
 
 
 def test_no_text_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

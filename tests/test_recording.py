@@ -523,6 +523,17 @@ def test_zeros_behind_the_last_record_are_a_cut(whole: Path, tmp_path: Path) -> 
     assert "nothing can be read from byte" in problem
 
 
+def test_zeros_for_the_rest_of_the_last_chunk_are_a_cut(whole: Path, tmp_path: Path) -> None:
+    """A file system that lost power knows a file's length, and not all that was written."""
+    content, (start, end, _) = whole.read_bytes(), chunks(whole)[2]
+    before = changed(tmp_path / "kept.mcap", content[:start]).ticks
+    for first in (*range(start + 1, start + 60), (start + end) // 2, end - 2):
+        zeros = bytes(end - first + 5000)
+        recording = changed(tmp_path / "cut.mcap", content[:first] + zeros)
+        assert (recording.is_cut, recording.problems) == (True, ()), first - start
+        assert recording.ticks.tobytes() == before.tobytes()
+
+
 @pytest.mark.parametrize("copies", [0, 1])
 def test_bytes_behind_a_whole_file_are_damage_and_no_cut(
     copies: int, whole: Path, tmp_path: Path
@@ -599,6 +610,19 @@ def test_damaged_length_loses_no_later_chunk(whole: Path, tmp_path: Path) -> Non
     assert f"nothing can be read from byte {second} to byte" in recording.problems[0]
     assert (np.diff(ticks) == 1).sum() == ticks.size - 2
     assert 1000 < ticks.size < 1300
+
+
+def test_damage_that_leaves_no_tick_is_the_reason_and_no_foreign_file(
+    whole: Path, tmp_path: Path
+) -> None:
+    data, first = bytearray(whole.read_bytes()), chunks(whole)[0][0]
+    del data[first + 500 : first + 1012]  # all that follows stands elsewhere
+    with pytest.raises(RecordingError) as refusal:
+        changed(tmp_path / "run.mcap", data)
+    told = str(refusal.value).removeprefix(f"{tmp_path / 'run.mcap'} ")
+    assert told.startswith("is damaged, and none of its ticks can be read: the index at the end")
+    assert "nothing can be read from byte" in told
+    assert "no topic" not in told
 
 
 def test_chunk_that_claims_exabytes_is_not_allocated(whole: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import re
 import stat
 import struct
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -30,7 +31,7 @@ from hapticbridge.device.trajectory import (
 from hapticbridge.errors import DeviceError, RecordingError, choices
 from hapticbridge.files import foreign_kind
 from hapticbridge.kernel.record import TickFlag
-from hapticbridge.units import format_number
+from hapticbridge.units import format_count, format_number
 
 # Any of them
 
@@ -221,7 +222,7 @@ def _read_lines(path: Path) -> list[str]:
         # a spreadsheet's "Unicode text" is UTF-16, and begins with its byte-order mark
         with path.open("rb") as file:
             is_wide = file.read(2) in {codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE}
-        return path.read_text(encoding="utf-16" if is_wide else "utf-8-sig").split("\n")
+        lines = path.read_text(encoding="utf-16" if is_wide else "utf-8-sig").split("\n")
     except FileNotFoundError:
         raise DeviceError(f"{path}: no such file") from None
     except UnicodeDecodeError as error:
@@ -235,6 +236,12 @@ def _read_lines(path: Path) -> list[str]:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise DeviceError(f"{path}: cannot be read ({reason})") from None
+    if held := next((number for number, line in enumerate(lines, 1) if "\0" in line), 0):
+        raise DeviceError(
+            f"{path}, line {held}: holds a NUL character, as a damaged file does, UTF-16 without "
+            "its byte-order mark and UTF-32; write the table in UTF-8"
+        )
+    return lines
 
 
 def _column_names(where: str, line: str, fields: list[str]) -> list[str]:
@@ -252,10 +259,10 @@ def _column_names(where: str, line: str, fields: list[str]) -> list[str]:
     if set(EXPORTED) <= set(names):
         own = dict(zip(EXPORTED, known, strict=True))
         return [own.get(name, "") for name in names]
-    if scaled := next((name for name in names if name.endswith(("ms", "mm"))), ""):
+    if scaled := next(filter(None, (re.search(r"(ms|mm)\W*$", name) for name in names)), None):
         raise DeviceError(
-            f"{where}: column {scaled!r:.40} looks like {scaled[-2:]}; times are in s and "
-            f"positions in m: divide by 1000, and name the column {scaled[0]}"
+            f"{where}: column {scaled.string!r:.40} looks like {scaled[1]}; times are in s and "
+            f"positions in m: divide by 1000, and name the column {scaled.string[0]}"
         )
     if missing := [name for name in TIME_AND_POSITION if name not in names]:
         raise DeviceError(f"{where}: column {', '.join(missing)} is missing; {needed}")
@@ -451,9 +458,9 @@ def read_bag(path: Path, topic: str = "") -> Motion:
         topic: The topic; it may be empty if there is only one of ``PoseStamped`` with messages.
 
     Raises:
-        DeviceError: The file cannot be read, a checksum of it does not match, it has no such topic,
-            a message is not valid, the poses are in several frames, or some stamps are 0 and others
-            of another clock.
+        DeviceError: The file cannot be read, a checksum or the number of messages in its index does
+            not match, it has no such topic, a message is not valid, the poses are in several
+            frames, or some stamps are 0 and others of another clock.
 
     Warns:
         UserWarning: Times look like those of another unit.
@@ -498,6 +505,12 @@ def read_bag(path: Path, topic: str = "") -> Motion:
             raise DeviceError(
                 f"{path}: message {len(rows[topic])} of {topic} cannot be read ({reason})"
             ) from None
+    for name, count in _counted(index):
+        if name in rows and count != len(rows[name]):
+            raise DeviceError(
+                f"{path} is damaged: its index counts {format_count(count, 'message')} of {name}, "
+                f"and {len(rows[name])} can be read"
+            )
     if len(filled := [name for name, own in rows.items() if own]) > 1:
         raise DeviceError(
             f"{path}: has several topics of {POSE}; name one, 'trajectory:{path}:{filled[0]}': "
@@ -520,6 +533,16 @@ def read_bag(path: Path, topic: str = "") -> Motion:
     if fault := first_fault(table):
         raise DeviceError(f"{path}, message {fault[0]} of {topic}: {fault[1]}")
     return _plausible(table, path)
+
+
+def _counted(index: Any) -> Iterator[tuple[str, int]]:
+    """Yields topic and number of messages as the index of an MCAP file states them, if it does."""
+    statistics = None if index is None else index.statistics
+    counts: Counter[str] = Counter()
+    for channel, count in ({} if statistics is None else statistics.channel_message_counts).items():
+        if channel in index.channels:
+            counts[index.channels[channel].topic] += count
+    yield from counts.items()
 
 
 def _refuse_unset(path: Path, topic: str, times: NDArray[np.int64]) -> None:

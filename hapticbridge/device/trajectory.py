@@ -251,7 +251,7 @@ def _next_sample(
     sample.buttons = 0
 
 
-def _prescribed(duration: float, rate: float | None, **limits: Any) -> DeviceInfo:
+def _prescribed(duration: float, rate: float | None, **sheet: Any) -> DeviceInfo:
     """Returns the data sheet of a device that no force moves."""
     return DeviceInfo(
         name="trajectory",
@@ -261,7 +261,7 @@ def _prescribed(duration: float, rate: float | None, **limits: Any) -> DeviceInf
         is_prescribed=True,
         is_real=False,
         duration=duration,
-        **limits,
+        **sheet,
     )
 
 

@@ -393,6 +393,12 @@ class Container:
         return record
 
     def _unpack(self, label: str, start: int, stop: int) -> Block:
+        block = self._chunk(label, start, stop)
+        # after a power failure, zeros may stand for the rest of the last chunk
+        is_cut_here = block.fault and self.is_cut and self._data.is_zero_from(stop - 1)
+        return Block(label, b"") if is_cut_here else block
+
+    def _chunk(self, label: str, start: int, stop: int) -> Block:
         record = self._data[start:stop]
         fields = Fields(record, _RECORD.size, len(record))
         try:

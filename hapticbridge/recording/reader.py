@@ -536,6 +536,11 @@ def _read_through(
     if not contents.has_ticks:
         # a file cut inside its first chunk has no schema yet, but has metadata
         if contents.refusal or contents.meta is None or not container.is_cut:
+            if contents.meta is not None and contents.problems and not contents.refusal:
+                damage = "; ".join(dict.fromkeys(contents.problems))
+                raise RecordingError(
+                    f"{path} is damaged, and none of its ticks can be read: {damage}"
+                )
             lacks = f"it has no topic {layout.TICK_TOPIC}"
             cut = [CUT] if container.is_cut else []
             reason = contents.refusal or "; ".join([lacks, *cut, *contents.problems[:1]])

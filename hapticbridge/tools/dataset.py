@@ -516,9 +516,9 @@ def write_dataset(
 
     Raises:
         RecordingError: The task is no Unicode text, there is no recording, one is named twice,
-            damaged, cut, of another scene than the first or cannot be simulated again, or has fewer
-            states of its scene than frames; scenes of several names have no task; the format is
-            unknown, or the folder exists or cannot be written.
+            damaged, cut, of another scene or grip than the first or cannot be simulated again, or
+            has fewer states of its scene than frames; scenes of several names have no task; the
+            format is unknown, or the folder exists or cannot be written.
         HapticBridgeError: Nothing can be drawn here, or the scene has no such camera.
     """
     if form not in DATASETS:
@@ -539,6 +539,12 @@ def write_dataset(
         raise RecordingError(
             f"the recordings are of the scenes {choices(scenes)}, and one's name is no task for "
             "all; say with --task what was done"
+        )
+    grips = dict.fromkeys(each.meta.get("grip", "") for each in recordings)
+    if len(grips) > 1:
+        raise RecordingError(
+            f"the recordings are of the grips {choices(grips)}; the poses of a data set are of one "
+            "grip, so write a set for each"
         )
     draft, counts, repeats, odd = draft_of(folder), [], [], dict[str, list[str]]()
     try:
