@@ -221,7 +221,7 @@ def test_each_mistake_of_a_program_gets_a_sentence() -> None:
         with pytest.raises(HapticBridgeError, match="normal of a surface"):
             device.show(START, None, [Surface((0, 0, 0), (0, 0, 0))])
         strange: Any
-        for strange in (Surface((0, 0, 0), (0, 0, 1)), [((0, 0, 0), (0, 0, 1))]):
+        for strange in (Surface((0, 0, 0), (0, 0, 1)), [((0, 0, 0), (0, 0, 1))], None, 5, "no"):
             with pytest.raises(HapticBridgeError, match="must be a list of Surface"):
                 device.show(START, None, strange)
         for wrong in (Surface((0, 0), (0, 0, 1)), Surface((0, 0, 0), (0, 0, 1), -0.1)):
