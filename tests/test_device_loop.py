@@ -35,6 +35,7 @@ from hapticbridge.audit.batch import audit_all
 from hapticbridge.errors import DeviceLost, HapticBridgeError
 from hapticbridge.program import poses
 from hapticbridge.program.device_loop import Handle, Surface
+from hapticbridge.program.loop_process import PROGRAM_VARIABLE
 from hapticbridge.program.messages import (
     CALL_DTYPE,
     STATE_DTYPE,
@@ -361,6 +362,21 @@ main(["serve", "simulated", "--json"])
 """
     told = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert "program that was killed" in told.stdout
+
+
+def test_a_loop_ends_whose_program_was_killed_before_it_looked() -> None:
+    """A process that another one has taken over does not see that its parent has gone."""
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    told = subprocess.run(
+        [sys.executable, "-m", "hapticbridge", "serve", "simulated", "--json", "--port", "0"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,  # it may end before its first tick
+        env={**os.environ, PROGRAM_VARIABLE: str(gone.pid)},
     )
     assert "program that was killed" in told.stdout
 

@@ -379,11 +379,28 @@ def test_a_model_changed_in_mid_run_is_named_by_the_summary_as_by_the_audit(
     assert "recording was changed" not in report.sentence
 
 
-WRITES: dict[str, Callable[[hb.Bridge], None]] = {
-    "data.qvel": lambda bridge: bridge.scene.data.qvel.__setitem__(-1, 1.0),
-    "data.ctrl": lambda bridge: bridge.scene.data.ctrl.__setitem__(0, 0.1),
-    "data.xfrc_applied": lambda bridge: bridge.scene.data.xfrc_applied.__setitem__((1, 2), 1.0),
-    "": lambda bridge: bridge.set_input(ctrl={"m": 0.1}),
+def _pushed(bridge: hb.Bridge) -> None:
+    bridge.scene.data.qvel[-1] = 1.0
+
+
+def _driven(bridge: hb.Bridge) -> None:
+    bridge.scene.data.ctrl[0] = 0.1
+
+
+def _pulled(bridge: hb.Bridge) -> None:
+    bridge.scene.data.xfrc_applied[1, 2] = 1.0
+
+
+def _as_it_should_be(bridge: hb.Bridge) -> None:
+    bridge.set_input(ctrl={"m": 0.1})
+    bridge.scene.data.mocap_pos.fill(0.3)  # of the bridge's own handle, which it places itself
+
+
+WRITES = {
+    "data.qvel": _pushed,
+    "data.ctrl": _driven,
+    "data.xfrc_applied": _pulled,
+    "": _as_it_should_be,
 }
 """Writes of a program by the field that is changed past the recording."""
 

@@ -27,7 +27,7 @@ from hapticbridge.demand.methods import RIGID, SCENE, Method, method_named
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CouplingError, HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
-from hapticbridge.kernel.codes import added_actuators
+from hapticbridge.kernel.codes import added_actuators, handle_ids
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.rigid_contact import WRITTEN
@@ -109,9 +109,23 @@ def watched_fields(model: mujoco.MjModel) -> dict[str, bytes]:
     return watched
 
 
-def watched_state(data: mujoco.MjData) -> dict[str, bytes]:
-    """Returns the numbers of a state by name, which nothing but a program writes between ticks."""
-    return {f"data.{name}": getattr(data, name).tobytes() for name in _OF_STATE}
+def state_of_scene(model: mujoco.MjModel) -> dict[str, Any]:
+    """Returns which numbers of a state are the scene's own, by field of the data.
+
+    The bridge writes to its handles and their couplings, so nothing that is written there stays.
+    """
+    handles = list(handle_ids(model).values())
+    mocaps = model.body_mocapid[handles]
+    controls = model.actuator_ctrladr[list(added_actuators(model))]
+    own = {"ctrl": (model.nu, controls), "xfrc_applied": (model.nbody, handles)}
+    own |= dict.fromkeys(("mocap_pos", "mocap_quat"), (model.nmocap, mocaps))
+    rest = {name: np.setdiff1d(np.arange(count), ids) for name, (count, ids) in own.items()}
+    return {name: rest.get(name, ...) for name in _OF_STATE}
+
+
+def watched_state(data: mujoco.MjData, parts: Mapping[str, Any]) -> dict[str, bytes]:
+    """Returns the ``state_of_scene``, which nothing but a program writes to between two ticks."""
+    return {f"data.{name}": getattr(data, name)[part].tobytes() for name, part in parts.items()}
 
 
 def changed_words(fields: str) -> str:

@@ -69,6 +69,7 @@ from hapticbridge.run.description import (
     describe_scene,
     describe_start,
     start_state,
+    state_of_scene,
     watched_fields,
     watched_state,
 )
@@ -336,6 +337,7 @@ class Session:
             self._open(resources)
             resources.callback(self.command_zero_force)
             self._watched = watched_fields(self.setup.scene.model)
+            self._parts = state_of_scene(self.setup.scene.model)
             self._written: set[str] = set()
             self._keep_state()
             self._resources = resources.pop_all()
@@ -562,12 +564,13 @@ class Session:
     def _keep_state(self) -> None:
         """Keeps the state, unless a scene changes it in a thread of its own."""
         is_still = self.beside is None or self.clock.may_wait
-        self._state = watched_state(self.setup.scene.data) if is_still else {}
+        data = self.setup.scene.data
+        self._state = watched_state(data, self._parts) if is_still else {}
 
     def _compare_state(self) -> None:
         """Notes the fields of the state that are not what they were when it was kept."""
         if self._state:
-            now = watched_state(self.setup.scene.data)
+            now = watched_state(self.setup.scene.data, self._parts)
             self._written |= {name for name in now if now[name] != self._state[name]}
 
     def _close_scene(self) -> None:
