@@ -89,6 +89,16 @@ def test_a_program_of_its_own_is_felt_recorded_and_repeated(tmp_path: Path) -> N
     assert 0.0 < credit < 1.0
 
 
+@pytest.mark.filterwarnings("ignore:the tool is shown at")
+def test_a_tool_far_from_the_origin_leaves_a_sound_recording(tmp_path: Path) -> None:
+    """At 1e8 m numbers are 1.5e-8 m apart, which was taken for a changed recording."""
+    path, far = tmp_path / "run.mcap", [1e8, 0.0, 0.0]
+    with DeviceLoop("simulated", recording=path, is_simulated=True) as device:
+        followed(device, 0.5, pose=[*far, 1.0, 0.0, 0.0, 0.0])
+    report = audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
 def test_the_wrench_makes_the_work_known_to_the_last_digit() -> None:
     """A ledger of its own sums force times motion of a mass that the program moves."""
     mass, x, v, work = 0.5, START.copy(), np.zeros(3), 0.0
