@@ -35,6 +35,7 @@ from hapticbridge.audit.batch import audit_all
 from hapticbridge.errors import DeviceLost, HapticBridgeError
 from hapticbridge.program import poses
 from hapticbridge.program.device_loop import Handle, Surface
+from hapticbridge.program.loop_process import PROGRAM_VARIABLE
 from hapticbridge.program.messages import (
     CALL_DTYPE,
     STATE_DTYPE,
@@ -86,6 +87,16 @@ def test_a_program_of_its_own_is_felt_recorded_and_repeated(tmp_path: Path) -> N
     assert max(np.linalg.norm(handle.wrench[:3]) for handle in handles) > 0.05
     assert all(handle.is_held for handle in handles[20:])
     assert 0.0 < credit < 1.0
+
+
+@pytest.mark.filterwarnings("ignore:the tool is shown at")
+def test_a_tool_far_from_the_origin_leaves_a_sound_recording(tmp_path: Path) -> None:
+    """At 1e8 m numbers are 1.5e-8 m apart, which was taken for a changed recording."""
+    path, far = tmp_path / "run.mcap", [1e8, 0.0, 0.0]
+    with DeviceLoop("simulated", recording=path, is_simulated=True) as device:
+        followed(device, 0.5, pose=[*far, 1.0, 0.0, 0.0, 0.0])
+    report = audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
 
 
 def test_the_wrench_makes_the_work_known_to_the_last_digit() -> None:
@@ -221,7 +232,7 @@ def test_each_mistake_of_a_program_gets_a_sentence() -> None:
         with pytest.raises(HapticBridgeError, match="normal of a surface"):
             device.show(START, None, [Surface((0, 0, 0), (0, 0, 0))])
         strange: Any
-        for strange in (Surface((0, 0, 0), (0, 0, 1)), [((0, 0, 0), (0, 0, 1))]):
+        for strange in (Surface((0, 0, 0), (0, 0, 1)), [((0, 0, 0), (0, 0, 1))], None, 5, "no"):
             with pytest.raises(HapticBridgeError, match="must be a list of Surface"):
                 device.show(START, None, strange)
         for wrong in (Surface((0, 0), (0, 0, 1)), Surface((0, 0, 0), (0, 0, 1), -0.1)):
@@ -361,6 +372,21 @@ main(["serve", "simulated", "--json"])
 """
     told = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert "program that was killed" in told.stdout
+
+
+def test_a_loop_ends_whose_program_was_killed_before_it_looked() -> None:
+    """A process that another one has taken over does not see that its parent has gone."""
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    told = subprocess.run(
+        [sys.executable, "-m", "hapticbridge", "serve", "simulated", "--json", "--port", "0"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,  # it may end before its first tick
+        env={**os.environ, PROGRAM_VARIABLE: str(gone.pid)},
     )
     assert "program that was killed" in told.stdout
 

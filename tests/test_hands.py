@@ -642,3 +642,18 @@ def test_a_board_and_a_spacemouse_hold_one_scene(tmp_path: Path) -> None:
     assert np.abs(model.wrench).max() == 0.0
     report = hb.audit(path, in_process=True)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+def test_a_tool_too_heavy_for_a_hand_that_holds_a_joint_is_carried(tmp_path: Path) -> None:
+    """The trial of a carried tool looked for a site of the joint's name, and there was none."""
+    path = tmp_path / "lever.xml"
+    path.write_text(
+        """<mujoco><worldbody><body gravcomp="1"><freejoint/><geom size=".02" mass=".1"/>
+        <site name="a"/></body><body pos="0 1 0"><joint name="jaw" axis="0 1 0"/>
+        <geom pos=".2 0 0" size=".02" mass="8"/></body></worldbody></mujoco>"""
+    )
+    grasps = [hb.Grasp("a"), hb.Grasp("joint:jaw")]
+    with hb.Bridge(path, grasps, clock=hb.SimulatedClock()) as bridge:
+        assert bridge.scene.is_carried
+        bridge.run(0.05)
+    assert bridge.summary().verdict == "passive"

@@ -278,6 +278,8 @@ def test_tool_that_the_device_cannot_hold_is_carried(
     assert run.meta["tool_weight"] == ("carried" if is_carried else "felt")
 
 
+FREE = outside.mjcf(body=outside.FREE_TOOL.replace('"0.1"', '"{}"'))
+
 HAMMER = """<mujoco><option timestep="0.001"/><worldbody><body pos="0 0 0.2"><freejoint/>
 <geom type="box" pos="0.3 0 0" size="0.015 0.015 0.04" mass="{}"/><site name="grip"/></body>
 </worldbody></mujoco>"""
@@ -311,6 +313,30 @@ def test_tool_whose_torque_the_device_cannot_hold_is_carried(
         assert torque < 1e-3 * float(found[1]) < 2.0 * torque  # it falls from rest
     report = hb.audit(tmp_path / "run.mcap")
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+@pytest.mark.parametrize(
+    ("text", "gains", "limits", "words"),
+    [
+        # 0.4 kg weigh 3.92 N
+        (FREE.format(0.4), {"stiffness": 25.0}, {}, ""),
+        (FREE.format(0.4), {"stiffness": 15.0}, {}, "stretches .* by 26. mm, .* limit is 200 mm"),
+        (FREE.format(0.4), {"stiffness": 99.0}, {"stretch": 0.03}, "by 39.. mm, .* is 30 mm"),
+        # it hangs where m g l cos(a) = K_r a
+        (HAMMER.format(0.1), {"rotational_stiffness": 0.5}, {}, ""),
+        (HAMMER.format(0.1), {"rotational_stiffness": 0.5}, {"angle": 0.4}, "turns .* by 513 mrad"),
+    ],
+)
+def test_tool_that_hangs_beyond_a_limit_of_the_run_is_carried(
+    tmp_path: Path, text: str, gains: dict[str, float], limits: dict[str, float], words: str
+) -> None:
+    """It was stopped at tick 0, before the hand had moved."""
+    limited = hb.Limits(**limits)
+    with started(tmp_path, text, coupling=gains, limits=limited) as bridge:
+        bridge.run(duration=0.05)
+        said = [change for change in bridge.scene.changes if change.startswith("weight of")]
+    assert bool(said) == bool(words)
+    assert re.search(words, "".join(said))
 
 
 def test_motor_that_turns_the_tool_is_not_taken_for_its_weight(tmp_path: Path) -> None:

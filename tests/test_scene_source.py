@@ -12,6 +12,7 @@ import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -341,6 +342,10 @@ def _stronger_motor(model: mujoco.MjModel) -> None:
     model.actuator("m").gainprm[0] = 2.0
 
 
+TURNED = """<body pos="1 0 0"><joint name="j"/><geom size=".1" mass="1"/></body>"""
+MOTOR = '<actuator><motor name="m" joint="j" ctrlrange="0 .1"/></actuator>'
+
+
 @pytest.mark.parametrize(
     ("change", "fields"),
     [
@@ -353,9 +358,7 @@ def _stronger_motor(model: mujoco.MjModel) -> None:
 def test_a_model_changed_in_mid_run_is_named_by_the_summary_as_by_the_audit(
     tmp_path: Path, change: Callable[[mujoco.MjModel], None], fields: str, method: str
 ) -> None:
-    turned = """<body pos="1 0 0"><joint name="j"/><geom size=".1" mass="1"/></body>"""
-    motor = '<actuator><motor name="m" joint="j" ctrlrange="0 .1"/></actuator>'
-    scene = load_scene(scene_file(tmp_path, mjcf(motor, world=turned)))
+    scene = load_scene(scene_file(tmp_path, mjcf(MOTOR, world=TURNED)))
     path, options = tmp_path / "run.mcap", hb.BridgeOptions(method=method)
     with hb.Bridge(
         scene, "simulated", clock=hb.SimulatedClock(), recording=path, options=options
@@ -368,12 +371,70 @@ def test_a_model_changed_in_mid_run_is_named_by_the_summary_as_by_the_audit(
         change(scene.model)
         summary = bridge.run(0.1)
     words = f"{fields} of the scene was changed during the run other than by set_input"
-    assert summary.changed == words
-    assert f"{words}: no recording can repeat that" in str(summary)
+    assert (summary.changed, summary.verdict) == (words, "unverified")
+    assert f"unverified: {words}: no recording can repeat that" in str(summary)
     report = audit(path)
     assert report.verdict == "invalid"
     assert report.sentence.endswith(f": {words}")
     assert "recording was changed" not in report.sentence
+
+
+def _pushed(bridge: hb.Bridge) -> None:
+    bridge.scene.data.qvel[-1] = 1.0
+
+
+def _driven(bridge: hb.Bridge) -> None:
+    bridge.scene.data.ctrl[0] = 0.1
+
+
+def _pulled(bridge: hb.Bridge) -> None:
+    bridge.scene.data.xfrc_applied[1, 2] = 1.0
+
+
+def _as_it_should_be(bridge: hb.Bridge) -> None:
+    bridge.set_input(ctrl={"m": 0.1})
+    bridge.scene.data.mocap_pos.fill(0.3)  # of the bridge's own handle, which it places itself
+
+
+WRITES = {
+    "data.qvel": _pushed,
+    "data.ctrl": _driven,
+    "data.xfrc_applied": _pulled,
+    "": _as_it_should_be,
+}
+"""Writes of a program by the field that is changed past the recording."""
+
+
+@pytest.mark.parametrize("is_between", [False, True])
+@pytest.mark.parametrize("fields", WRITES)
+@pytest.mark.parametrize("options", [{}, {"scene_rate": 250.0}])
+def test_a_state_written_in_mid_run_is_named_by_the_summary_as_by_the_audit(
+    tmp_path: Path, fields: str, options: dict[str, Any], *, is_between: bool
+) -> None:
+    scene = load_scene(scene_file(tmp_path, mjcf(MOTOR, world=TURNED)))
+    path, write = tmp_path / "run.mcap", WRITES[fields]
+    with hb.Bridge(
+        scene, "simulated", clock=hb.SimulatedClock(), recording=path, **options
+    ) as bridge:
+        bridge.run(0.05, lambda _: None)
+        if is_between:
+            write(bridge)
+        summary = bridge.run(0.1, lambda tick: None if is_between or tick != 60 else write(bridge))
+    report = audit(path)
+    words = f"{fields} of the scene was changed during the run other than by set_input"
+    assert summary.changed == (words if fields else "")
+    assert (summary.verdict, report.verdict) == (
+        ("unverified", "invalid") if fields else ("passive", "passive")
+    )
+    assert report.sentence.endswith(f": {words}") or not fields
+
+
+def test_a_scene_painted_in_mid_run_is_the_recorded_one(tmp_path: Path) -> None:
+    scene, path = load_scene("point_mass"), tmp_path / "run.mcap"
+    with hb.Bridge(scene, clock=hb.SimulatedClock(), recording=path) as bridge:
+        bridge.run(0.05, lambda _: scene.model.geom_rgba.fill(0.5))
+        assert (bridge.summary().changed, bridge.summary().verdict) == ("", "passive")
+    assert audit(path).resimulation == "bit for bit"
 
 
 def test_a_state_that_a_run_leaves_for_its_start_is_told(tmp_path: Path) -> None:

@@ -198,16 +198,18 @@ def _handle_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Devia
     slipped = pulled + ticks["handle_position"] - position
     back = quaternion_of((1.0 / parameters.law_evaluations - 1.0) * turned)
     slipped_turn = turn_between(tool[:, 3:], quaternion_product(back, ticks["handle_quaternion"]))
-    for kind, name, amount, lengths, unit in (
-        (0, "handle_position", off, (pulled, slipped), "m"),
-        (1, "handle_quaternion", angle, (pulled_turn, slipped_turn), "rad"),
+    rounded = _ROUNDING * np.abs(position).max(axis=1)  # of a scene far from its origin
+    for kind, name, amount, lengths, unit, rounding in (
+        (0, "handle_position", off, (pulled, slipped), "m", rounded),
+        (1, "handle_quaternion", angle, (pulled_turn, slipped_turn), "rad", 0.0),
     ):
         stored, kept = (
             springs(k, parameters)[kind].energy(e)
             for k, e in zip((before, gains), lengths, strict=True)
         )
         gained = np.where(has_slipped & (amount > TOLERANCE), kept - stored, amount)
-        yield Deviation(name, gained, TOLERANCE * (1 + stored), unit, "device pose and lever")
+        allowed = TOLERANCE * (1 + stored) + rounding
+        yield Deviation(name, gained, allowed, unit, "device pose and lever")
 
 
 def axes_with_motor(parameters: RunParameters) -> Array:

@@ -31,7 +31,7 @@ from hapticbridge.clock import RealClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.guard import refuse_simulated_time
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.program.loop_process import TOKEN_VARIABLE
+from hapticbridge.program.loop_process import PROGRAM_VARIABLE, TOKEN_VARIABLE
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.endpoint import CREDIT, Endpoint, GrantedClock, posted_scene, program_options
 from hapticbridge.run.options import DEFAULT_OPTIONS, BridgeOptions
@@ -50,10 +50,19 @@ GONE = "program that was killed"
 
 
 def _watch_parent(parent: int, leave: Callable[[], None]) -> None:
-    """Ends the loop when the process that started it is gone."""
-    while os.getppid() == parent:
+    """Ends the loop when the process that started it is gone, also before this one looked."""
+    program = os.environ.get(PROGRAM_VARIABLE, "")
+    while os.getppid() == parent and (not program.isdecimal() or _lives(int(program))):
         time.sleep(LOOK)
     leave()
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except OSError as error:
+        return isinstance(error, PermissionError)
+    return True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

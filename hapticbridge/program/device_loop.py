@@ -432,14 +432,14 @@ class DeviceLoop:
                     f"velocity has shape {numbers.shape}; it must be 3 or 6 numbers"
                 )
             post["has_velocity"], post["velocity"][0, : numbers.size] = 1, numbers
+        if not isinstance(surfaces, list | tuple) or any(type(s) is not Surface for s in surfaces):
+            raise HapticBridgeError(
+                f"surfaces are {surfaces!r}; they must be a list of Surface(point, normal, gap)"
+            )
         if len(surfaces) > PLANES:
             raise HapticBridgeError(f"{len(surfaces)} surfaces are shown; {PLANES} are the most")
         post["planes"] = len(surfaces)
         for k, surface in enumerate(surfaces):
-            if not isinstance(surface, Surface):
-                raise HapticBridgeError(
-                    f"surfaces are {surfaces!r}; they must be a list of Surface(point, normal, gap)"
-                )
             normal, part = numbers_of("normal", surface.normal), slice(3 * k, 3 * k + 3)
             if normal.shape != (3,) or not np.any(normal):
                 raise HapticBridgeError("the normal of a surface must be 3 numbers, not all 0")

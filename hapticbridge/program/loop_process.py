@@ -17,6 +17,9 @@ from hapticbridge.errors import HapticBridgeError
 TOKEN_VARIABLE = "HAPTICBRIDGE_TOKEN"
 """Environment variable with the token of a loop."""
 
+PROGRAM_VARIABLE = "HAPTICBRIDGE_PROGRAM"
+"""Environment variable with the number of the process that a loop serves, and ends with."""
+
 READY_TIME, CLOSE_TIME = 300.0, 60.0
 """Longest waits in s: for a loop that starts (the first start compiles), and for one that ends and
 closes its recording."""
@@ -56,7 +59,11 @@ class LoopProcess:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 text=True,
-                env={**os.environ, TOKEN_VARIABLE: self._token},
+                env={
+                    **os.environ,
+                    TOKEN_VARIABLE: self._token,
+                    PROGRAM_VARIABLE: str(os.getpid()),
+                },
                 start_new_session=True,  # Ctrl-C is the program's; it ends the loop in order
             )
         except OSError as error:

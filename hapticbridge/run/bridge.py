@@ -8,7 +8,7 @@ before the device is started. ``session`` owns the resources of an open run.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -52,16 +52,13 @@ from hapticbridge.run.options import (
     device_for_run,
 )
 from hapticbridge.run.request import RunRequest
-from hapticbridge.run.session import Session, StopRequest
+from hapticbridge.run.session import OnTick, Session, StopRequest
 from hapticbridge.run.summary import Ledger, Summary
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.checks import refuse_callbacks
 from hapticbridge.scene.compile import clause
 from hapticbridge.scene.inputs import Write, input_writes
 from hapticbridge.signals import stopping_on_signals
-
-OnTick = Callable[[int], None]
-"""Function called with a tick's number before the tick, for scripted inputs."""
 
 _NOT_OPEN = "the bridge is not open; open it with 'with Bridge(...)' first"
 
@@ -225,7 +222,9 @@ class Bridge:
             duration: Time to run in s of the run's clock. Skipped deadlines count as time, pauses
                 between runs do not. None runs until the device's motion ends, one tick per sample,
                 or until a signal.
-            on_tick: Called with the tick's number before each tick, for scripted inputs.
+            on_tick: Called with the tick's number before each tick, for scripted inputs. It may
+                read the scene, as with ``mj_forward``; what it writes into the scene's state is no
+                part of the recording, and the summary names it.
 
         Returns:
             The summary of all ticks so far.
@@ -238,7 +237,7 @@ class Bridge:
         """
         session, trip = self._open_session(), None
         refuse_callbacks()
-        session.begin(duration)
+        session.begin(duration, has_program=on_tick is not None)
         with ExitStack() as stack:
             stack.callback(session.note_stop)
             stack.enter_context(stopping_on_signals(self.stop_on_signal))
@@ -248,7 +247,7 @@ class Bridge:
                 session.note_grants(stack.enter_context(real_time()))
             try:
                 session.start_clock()
-                trip = self._loop(session, on_tick)
+                trip = self._loop(session, session.watching(on_tick))
             except DeviceError as error:
                 trip = Trip(TripCode.DEVICE, session.tick, detail=str(error))
             except mujoco.FatalError as error:

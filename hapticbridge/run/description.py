@@ -27,7 +27,7 @@ from hapticbridge.demand.methods import RIGID, SCENE, Method, method_named
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CouplingError, HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
-from hapticbridge.kernel.codes import added_actuators
+from hapticbridge.kernel.codes import added_actuators, handle_ids
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
 from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.kernel.rigid_contact import WRITTEN
@@ -68,7 +68,7 @@ def model_digest(model: mujoco.MjModel) -> str:
 _OF_FILES = re.compile("n?paths|.*_pathadr|nbuffer")
 
 CHANGED_EVENT = "scene_changed"
-"""Event that names, as ``fields``, what a program changed in the compiled model during a run."""
+"""Event that names, as ``fields``, what a program changed in model or data during a run."""
 
 _MAX_WATCHED = 1_000_000
 """Largest array in bytes that is compared at the end of a run. Larger ones are meshes and textures,
@@ -77,16 +77,29 @@ whose comparison would hold up short runs."""
 _OF_A_RUN = ("enableflags", "solver", *WRITTEN)
 """Fields of the model that a run itself writes to."""
 
+_OF_PICTURES = re.compile(r"(light|mat|tex|skin)_.*|.*_(rgba|matid)")
+"""Fields of the model that are drawn alone."""
+
+_OF_STATE = (
+    *("qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied"),
+    *("eq_active", "mocap_pos", "mocap_quat"),
+)
+"""Fields of the data from which MuJoCo steps, and which a program may write to."""
+
 
 def watched_fields(model: mujoco.MjModel) -> dict[str, bytes]:
     """Returns the numbers of a compiled model by name, without those that a run itself writes to.
 
-    Arrays above ``_MAX_WATCHED``, and the gains of the coupling's actuators are left out.
+    Arrays above ``_MAX_WATCHED``, the gains of the coupling's actuators and what is drawn alone are
+    left out.
     """
     added, watched = list(added_actuators(model)), {}
     for prefix, part in (("", model), ("opt.", model.opt)):
         for name in dir(part):
-            value = None if name.startswith("_") or name in _OF_A_RUN else getattr(part, name)
+            is_left_out = name.startswith("_") or name in _OF_A_RUN
+            if is_left_out or _OF_PICTURES.fullmatch(name):
+                continue
+            value = getattr(part, name)
             if isinstance(value, int | float):
                 watched[prefix + name] = repr(value).encode()
             elif isinstance(value, np.ndarray) and value.nbytes <= _MAX_WATCHED:
@@ -94,6 +107,25 @@ def watched_fields(model: mujoco.MjModel) -> dict[str, bytes]:
                     value = np.delete(value, added, axis=0)
                 watched[prefix + name] = value.tobytes()
     return watched
+
+
+def state_of_scene(model: mujoco.MjModel) -> dict[str, Any]:
+    """Returns which numbers of a state are the scene's own, by field of the data.
+
+    The bridge writes to its handles and their couplings, so nothing that is written there stays.
+    """
+    handles = list(handle_ids(model).values())
+    mocaps = model.body_mocapid[handles]
+    controls = model.actuator_ctrladr[list(added_actuators(model))]
+    own = {"ctrl": (model.nu, controls), "xfrc_applied": (model.nbody, handles)}
+    own |= dict.fromkeys(("mocap_pos", "mocap_quat"), (model.nmocap, mocaps))
+    rest = {name: np.setdiff1d(np.arange(count), ids) for name, (count, ids) in own.items()}
+    return {name: rest.get(name, ...) for name in _OF_STATE}
+
+
+def watched_state(data: mujoco.MjData, parts: Mapping[str, Any]) -> dict[str, bytes]:
+    """Returns the ``state_of_scene``, which nothing but a program writes to between two ticks."""
+    return {f"data.{name}": getattr(data, name)[part].tobytes() for name, part in parts.items()}
 
 
 def changed_words(fields: str) -> str:

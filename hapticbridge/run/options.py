@@ -750,6 +750,8 @@ class RunSetup(StepTimes):
                     and self._is_own(parameters, part, float(pull[part]))
                 ):
                     return self._heavy(parameters, part, float(weight[part]))
+        if reason := self._sagging(parameters):
+            return reason
         if pull[0] > most[0]:
             return ""
         force = self._toppling(scene, parameters)
@@ -758,6 +760,24 @@ class RunSetup(StepTimes):
                 f"it stands upright and topples: {TIPPED:g} m beside, it pulls with "
                 f"{format_number(force, 3)} N, and the device holds {format_number(most[0], 3)} N"
             )
+        return ""
+
+    def _sagging(self, parameters: RunParameters) -> str:
+        """Returns the clause on a weight that hangs beyond the guard's limit at rest; or empty."""
+        coupling, limits = parameters.coupling, self.limits
+        load, scale = self.load_at_rest(parameters), self.workspace.scale
+        for part, verb, stiffness, limit, name, unit in (
+            (0, "stretches", coupling.stiffness * scale, limits.stretch, "stretch", "m"),
+            (1, "turns", coupling.rotational_stiffness, limits.angle, "angle", "rad"),
+        )[: 1 + self.info.turns]:
+            if load[part] <= stiffness * limit or not stiffness:
+                continue
+            left = static_load(self.scene.with_tool_carried(), parameters)
+            if wrench_sizes(left)[part] <= stiffness * limit:
+                return (
+                    f"at rest it {verb} the coupling by {format_si(load[part] / stiffness, unit)}, "
+                    f"and the {name} limit is {format_si(limit, unit)}"
+                )
         return ""
 
     def _toppling(self, scene: Scene, parameters: RunParameters) -> float:

@@ -69,7 +69,9 @@ from hapticbridge.run.description import (
     describe_scene,
     describe_start,
     start_state,
+    state_of_scene,
     watched_fields,
+    watched_state,
 )
 from hapticbridge.run.hands import DeviceGroup
 from hapticbridge.run.options import RunSetup
@@ -83,6 +85,9 @@ from hapticbridge.scene import Scene
 from hapticbridge.scene.checks import strongest_actuator, working_pump
 from hapticbridge.scene.inputs import Write
 from hapticbridge.signals import deferring_stops
+
+OnTick = Callable[[int], None]
+"""Function called with a tick's number before the tick, for scripted inputs."""
 
 LONGEST = 1e9
 """Longest run in s, 30 years: beyond it numbers of ticks are too large to count."""
@@ -332,6 +337,9 @@ class Session:
             self._open(resources)
             resources.callback(self.command_zero_force)
             self._watched = watched_fields(self.setup.scene.model)
+            self._parts = state_of_scene(self.setup.scene.model)
+            self._written: set[str] = set()
+            self._keep_state()
             self._resources = resources.pop_all()
         self._is_begun = self.is_open = True
 
@@ -538,7 +546,32 @@ class Session:
     def _changed_fields(self) -> str:
         """Returns the fields of the model that a program changed since the start; else empty."""
         now = watched_fields(self.setup.scene.model)
-        return ", ".join(name for name, value in self._watched.items() if now.get(name) != value)
+        fields = [name for name, value in self._watched.items() if now.get(name) != value]
+        return ", ".join((*fields, *sorted(self._written)))
+
+    def watching(self, on_tick: OnTick | None) -> OnTick | None:
+        """Returns a function that calls a program's, and notes what it writes to the state."""
+        if on_tick is None:
+            return None
+
+        def watched(tick: int) -> None:
+            self._keep_state()
+            on_tick(tick)
+            self._compare_state()
+
+        return watched
+
+    def _keep_state(self) -> None:
+        """Keeps the state, unless a scene changes it in a thread of its own."""
+        is_still = self.beside is None or self.clock.may_wait
+        data = self.setup.scene.data
+        self._state = watched_state(data, self._parts) if is_still else {}
+
+    def _compare_state(self) -> None:
+        """Notes the fields of the state that are not what they were when it was kept."""
+        if self._state:
+            now = watched_state(self.setup.scene.data, self._parts)
+            self._written |= {name for name in now if now[name] != self._state[name]}
 
     def _close_scene(self) -> None:
         if self.beside is not None:
@@ -566,8 +599,11 @@ class Session:
         """Finishes the recording, or removes that of a run that never began."""
         self.stream.close(is_discarded=not self._is_begun)
 
-    def begin(self, duration: float | None) -> None:
+    def begin(self, duration: float | None, *, has_program: bool = False) -> None:
         """Sets the end of a run and its event; a later run starts with a ramp of the force.
+
+        With a program between the ticks nothing is computed ahead, because it may call MuJoCo's
+        functions for the scene's data, which would overwrite that.
 
         Raises:
             HapticBridgeError: The duration is not finite and > 0.
@@ -577,6 +613,7 @@ class Session:
             raise HapticBridgeError(
                 f"duration is {shown(duration)} s; it must be a number > 0, at most {LONGEST:g}"
             )
+        self._compare_state()  # what a program wrote since the last run
         if not self.tick:
             self._start_potential = float(self.kernel.state["energy"]["potential"][0])
         self._is_timed = duration is not None
@@ -597,9 +634,8 @@ class Session:
         self._before_trip = np.empty(0, TICK_DTYPE)
         # a callback that forbids the split may have been set since the bridge was opened
         model, method = self.setup.scene.model, self.setup.method
-        self.kernel.is_ahead = (
-            self.setup.is_pipelined and self.beside is None and can_split(model, method.scheme)
-        )
+        may_split = self.beside is None and can_split(model, method.scheme)
+        self.kernel.is_ahead = self.setup.is_pipelined and may_split and not has_program
 
     def note_grants(self, grants: tuple[Grant, ...]) -> None:
         """Records the answers of the system to the real-time requests; warns once of refusals."""
@@ -736,6 +772,7 @@ class Session:
 
     def note_stop(self) -> None:
         """Takes the requests that ended the run; later ones end the next run."""
+        self._keep_state()
         self._note_own_loop()
         by, signal = self.stop.take()
         if by:

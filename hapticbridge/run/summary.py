@@ -362,12 +362,14 @@ class Summary:
     @property
     def headline(self) -> str:
         """The verdict on the run and on its device, in a sentence."""
+        if self.verdict not in ("passive", "active"):
+            is_changed = self.ticks and self.changed
+            reason = f"{self.changed}: no recording can repeat that"
+            return f"{self.verdict}: {reason if is_changed else _UNJUDGED[self.verdict]}"
         if self.fault is not None:
             _, port = self.fault
             what = "the hand got energy for which nothing paid"
             return f"active: {'the simulation made energy' if port == 'environment' else what}"
-        if self.verdict != "passive":
-            return f"{self.verdict}: {_UNJUDGED[self.verdict]}"
         if self.certification.standing is Standing.NO_HAND:
             return "passive: the scene gave out no more energy than it got"
         if self.is_certified:
@@ -417,7 +419,7 @@ class Summary:
         yield from self._last_lines()
 
     def _verdict_lines(self) -> Iterator[str]:
-        if self.verdict == "empty":
+        if self.verdict == "empty" or self.changed:
             return
         tick, port = self.fault or (0, "")
         used = f"at its worst tick {format_share(self.slack_share)} of the slack used"
@@ -452,8 +454,6 @@ class Summary:
         skipped = f" ({self.skipped} deadlines skipped)" if self.skipped else ""
         if self.overlap:
             yield "overlap", f"{self.overlap} still; the scene began so"
-        if self.changed:
-            yield "scene", f"{self.changed}: no recording can repeat that"
         yield "overruns", f"{self.overruns}{skipped}, records dropped {self.dropped}"
         if self.probe:
             yield "probe", self.probe
@@ -532,11 +532,13 @@ class Summary:
     def verdict(self) -> str:
         """``passive`` (strict or within slack, without a metered kick), or ``active``.
 
-        It is ``unverified`` if MuJoCo dropped contacts or its numbers were bad, and ``empty`` if
-        the run held no tick.
+        It is ``unverified`` if a program changed the scene other than by an input, MuJoCo dropped
+        contacts or its numbers were bad, and ``empty`` if the run held no tick.
         """
         if not self.ticks:
             return "empty"
+        if self.changed:
+            return "unverified"
         if self.fault is not None:
             return "active"
         return "unverified" if self.trip and self.trip.is_unsound else "passive"

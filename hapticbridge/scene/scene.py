@@ -143,6 +143,7 @@ class Scene:
     findings: tuple[str, ...] = ()
 
     _spec: mujoco.MjSpec | None = None
+    _first_grip: str = ""
     _is_claimed: bool = False
     _reach: float = 0.0
     _period: float = 0.0
@@ -173,7 +174,9 @@ class Scene:
 
         It is outdated once the model is replaced (``carry_tool``).
         """
-        return self if hand == 0 else replace(self, grip=self.other_grips[hand - 1], hand=hand)
+        if hand == 0:
+            return self
+        return replace(self, grip=self.other_grips[hand - 1], hand=hand, _first_grip=self.grip)
 
     @property
     def credit(self) -> float:
@@ -206,7 +209,7 @@ class Scene:
             SceneError: MuJoCo stops there, or warns (``codes.WARNINGS``).
         """
         try:
-            go_to_start(self.model, self.data, self.grip)
+            go_to_start(self.model, self.data, self._first_grip or self.grip)
         except mujoco.FatalError as error:
             raise SceneError(
                 f"MuJoCo stops at the start of scene '{self.name}': {clause(error)}"
@@ -394,7 +397,8 @@ class Scene:
         self._spec.body(HANDLE).gravcomp = 1.0
         self._recompile(self._spec)
         model = self.model
-        held = {held_body(model, grip) for grip in (self.grip, *self.other_grips)}
+        grips = {self._first_grip or self.grip, *self.other_grips}
+        held = {held_body(model, grip) for grip in grips}
         own = {int(model.body_treeid[i]) for i in held}
         trees = sorted(set().union(*(tied_trees(model, tree) for tree in own)))
         model.body_gravcomp[np.isin(model.body_treeid, trees)] = 1.0
