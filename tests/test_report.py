@@ -359,6 +359,37 @@ def test_what_happened_in_the_same_ticks_is_no_cause(tmp_path: Path) -> None:
     assert (cause.kind, "connect 'tie'" in cause.evidence) == ("constraint", True)
 
 
+FALLS = """<mujoco><option iterations="{}" cone="elliptic"/><worldbody>
+  <geom type="plane" size="1 1 .1" pos="0 0 -.29"/>
+  <body pos=".012 .0057 .002" euler="42 32 44"><freejoint/><geom type="capsule" size=".015 .026"
+  mass=".035" euler="140 82 86" solref=".0005 8"/><body pos=".072 .017 -.039">
+  <joint type="slide" frictionloss=".18"/><joint type="slide" axis=".65 .2 .32"/>
+  <geom type="ellipsoid" size=".0064 .016 .015" mass=".47" contype="0" conaffinity="0"/></body>
+  </body><body pos=".063 -.0077 -.0087" euler="35 48 17"><joint stiffness="46" armature=".041"/>
+  <geom type="cylinder" size=".027 .015" mass=".22" euler="19 40 39" margin=".01"
+  solref=".0005 8"/><body pos=".066 -.077 .041"><joint/><geom type="cylinder" size=".015 .008"
+  mass=".16"/><body gravcomp="1"><joint type="slide"/><geom type="ellipsoid"
+  size=".0073 .019 .023" mass=".092"/><site name="grip"/></body></body></body>
+</worldbody></mujoco>"""
+"""A light capsule with a heavy slider in it falls past an arm, onto a floor."""
+
+
+def test_a_solver_that_stops_early_is_the_cause_where_more_iterations_help(tmp_path: Path) -> None:
+    scene, remedy = tmp_path / "floor.xml", 'write <option iterations="10">'
+    for iterations, verdict in ((1, "active"), (10, "passive")):
+        path = tmp_path / f"{iterations}.mcap"
+        scene.write_text(FALLS.format(iterations))
+        coupling = Coupling(200.0, 0.4, 0.16, 5e-4)
+        device = ScriptedDevice(report_runs.circling)
+        recorded(path, scene, device, coupling, contact="scene", duration=0.4)
+        report = audit(path)
+        assert report.verdict == verdict
+        if verdict == "active":
+            cause = cause_of(read_recording(path), report)
+            assert (cause.kind, cause.remedy) == ("solver", remedy)
+            assert "limit of 1 iteration:" in cause.evidence
+
+
 @pytest.mark.parametrize("contact", ["scene", "rigid"])
 def test_a_contact_that_lies_beside_is_no_cause(contact: str, tmp_path: Path) -> None:
     """A spring throws a light link, while a ball lies on a floor as hard as in ``HARD_FLOOR``."""
@@ -410,6 +441,26 @@ def test_a_joint_that_pumps_is_named_as_the_cause(tmp_path: Path) -> None:
     cause = cause_of(read_recording(path), audit(path))
     assert cause.kind == "pump"
     assert "joint 'rail' has a damping of -30" in cause.evidence
+
+
+def test_the_cause_of_the_most_is_told_where_another_was_earlier(tmp_path: Path) -> None:
+    """A breath of wind in the first tick, and a joint that pumps as the hand sets off."""
+    path, scene = tmp_path / "run.mcap", tmp_path / "fan.xml"
+    scene.write_text(
+        """<mujoco><option wind="0 0 .2" density="1.2" gravity="0 0 0"/><worldbody>
+        <body><joint name="rail" type="slide" axis="1 0 0" damping="-2"/>
+        <geom size="0.02" mass="0.5"/><site name="grip"/></body>
+        <body pos="0 3 3"><freejoint/><geom type="box" size=".1 .1 .01" mass=".05"/></body>
+        </worldbody></mujoco>"""
+    )
+    device = ScriptedDevice(lambda tick: (5e-4 * min(max(tick - 250, 0), 60), 0, 0, 1, 0, 0, 0))
+    recorded(path, scene, device, duration=0.4)
+    recording, report = read_recording(path), audit(path)
+    assert report.tick is not None
+    assert report.tick < 50
+    cause = cause_of(recording, report)
+    assert (cause.kind, cause.remedy) == ("pump", 'write damping="0" or more')
+    assert cause.evidence.startswith("most came in the 0.2 s before 0.")
 
 
 SHELF = '<body name="shelf" mocap="true" pos="0 0 -.05"><geom type="box" size="1 1 .05" {}/></body>'

@@ -597,8 +597,8 @@ def _solver_cause(
     return Cause(
         "solver",
         f"{share:.0%} of the energy created until then came in ticks in which MuJoCo's solver "
-        f"stopped at its limit of {limit} iterations: its forces are not those of the contacts "
-        "and constraints",
+        f"stopped at its limit of {format_count(limit, 'iteration')}: its forces are not those of "
+        "the contacts and constraints",
         f'write <option iterations="{10 * limit}">',
     )
 
@@ -794,6 +794,33 @@ def _input_work(evidence: Evidence, window: slice) -> float:
 
 # Search for the likely cause
 
+MUCH_MORE = 10.0
+"""Growth of the excess in a window, relative to that before the fault, from which on the window is
+searched for a larger cause; no unit."""
+
+MEASURED: tuple[Kind, ...] = (
+    *("contact setting", "pump", "inputs", "unmetered work"),
+    *("jumping tendon", "bottomless flex", "constraint", "solver"),
+)
+"""Causes that are named by what they did, and that a fling by another one cannot pretend."""
+
+
+def _cause_of_most(evidence: Evidence, report: AuditReport, window: slice) -> Cause:
+    """Returns the cause of the fault, or of a window that brought much more, if it is another."""
+    first = cause_in_environment(evidence, report, window)
+    energy, allowed = evidence.judged(report)
+    excess = np.concatenate([np.zeros(1), energy - allowed])
+    begins = np.maximum(np.arange(len(excess)) - round(WINDOW / evidence.parameters.period), 0)
+    growths = excess - excess[begins]
+    end = int(np.argmax(growths))
+    if end <= window.stop or growths[end] < MUCH_MORE * growths[window.stop]:
+        return first
+    larger = cause_in_environment(evidence, report, slice(int(begins[end]), end))
+    if larger.kind not in MEASURED or (larger.kind, larger.remedy) == (first.kind, first.remedy):
+        return first
+    when = f"most came in the {WINDOW:g} s before {evidence.time[end - 1]:.3f} s"
+    return replace(larger, evidence=f"{when}: {larger.evidence}")
+
 
 @dataclass(frozen=True, slots=True)
 class Excess:
@@ -852,7 +879,7 @@ def likely_cause(
     try:
         return _cause_in_scene(
             evidence.recording,
-            lambda model: cause_in_environment(replace(evidence, model=model), report, window),
+            lambda model: _cause_of_most(replace(evidence, model=model), report, window),
             in_process,
         )
     except HapticBridgeError:
