@@ -191,18 +191,28 @@ def _unknown_cause(evidence: Evidence) -> Cause:
 
 
 def _timing_cause(evidence: Evidence, window: slice) -> Cause | None:
-    """Returns missed deadlines or repeated samples as the cause; the device bears the coupling."""
+    """Returns missed deadlines or repeated samples as the cause; the device bears the coupling.
+
+    Most of the energy must have come beside them.
+    """
     flags = evidence.ticks["flags"][window]
-    missed = int(np.count_nonzero(flags & int(TickFlag.OVERRUN)))
+    is_late, is_repeated = (
+        (flags & int(flag)) != 0 for flag in (TickFlag.OVERRUN, TickFlag.STALE_SAMPLE)
+    )
+    gained = np.diff(evidence.excess, prepend=0.0)[window].clip(min=0.0)
     span = len(flags) * evidence.parameters.period
-    if missed:
+    late_share = _share_beside(is_late, gained)
+    if late_share >= MOST:
         return Cause(
             "rate",
-            f"ticks late by a period or more in the {format_number(span, 2)} s before: {missed}, "
-            "in each of which the wrench was held for longer",
+            f"{late_share:.0%} of the energy came beside ticks that were late by a period or more "
+            f"({np.count_nonzero(is_late)} in the {format_number(span, 2)} s before), in each of "
+            "which the wrench was held for longer",
             "lower the rate or the load of the machine ('hapticbridge doctor')",
         )
-    repeated = float(np.mean((flags & int(TickFlag.STALE_SAMPLE)) != 0))
+    if _share_beside(is_repeated, gained) < MOST:
+        return None
+    repeated = float(np.mean(is_repeated))
     # a device slower than the loop repeats each sample until its next one
     own = evidence.info.rate
     expected = max(0.0, 1.0 - own * evidence.parameters.period) if own else 0.0
@@ -215,6 +225,13 @@ def _timing_cause(evidence: Evidence, window: slice) -> Cause | None:
             "mend the link to the device, or lower the rate to what it delivers",
         )
     return None
+
+
+def _share_beside(marked: NDArray[np.bool_], gained: NDArray[np.float64]) -> float:
+    """Returns the share of an energy that came in marked ticks or in those next to them, (n,)."""
+    beside = np.convolve(marked, np.ones(3), mode="same")[: len(marked)] > 0.0
+    total = float(gained.sum())
+    return float(gained[beside].sum()) / total if total > 0.0 else 0.0
 
 
 def _quantisation_words(evidence: Evidence, window: slice) -> str:
