@@ -551,16 +551,21 @@ def test_a_connect_that_begins_open_is_the_cause_and_rigid_contacts_hold_it(tmp_
       <connect name="tie" site1="end" site2="post"/></equality></mujoco>"""
     scene, path = tmp_path / "scene.xml", tmp_path / "run.mcap"
     scene.write_text(text)
-    for contact, verdict in (("scene", "active"), ("rigid", "passive")):
+    for method, contact, remedy in (
+        ("lossless", "scene", "leave out --contact scene: rigid contacts"),
+        ("implicitfast", None, "use method 'lossless' or 'implicit': rigid contacts"),
+        ("lossless", "rigid", ""),
+    ):
+        verdict = "active" if remedy else "passive"
         with pytest.warns(UserWarning, match="connect 'tie' .* starts .* off"):
-            recorded(path, scene, duration=0.2, contact=contact)
+            recorded(path, scene, duration=0.2, method=method, contact=contact)
         report = audit(path)
         assert report.verdict == verdict
         if verdict == "active":
             cause = cause_by(evidence_of(read_recording(path)), report)
             assert cause.kind == "constraint"
             assert cause.evidence.startswith("connect 'tie' of site 'end' and 'post' did")
-            assert "--contact scene" in cause.remedy
+            assert cause.remedy.startswith(remedy)
         path.unlink()
 
 

@@ -456,7 +456,13 @@ def _contact_cause(
         return _method_cause(evidence.method, f"{did}; ")
     if is_rigid:
         return Cause("unknown", did, "lower the stiffness, or raise the rate")
-    return Cause("unknown", f"{did}; {usual}", "leave out --contact scene, or lower the stiffness")
+    remedy = f"{_rigid_change(evidence.method)}, or lower the stiffness"
+    return Cause("unknown", f"{did}; {usual}", remedy)
+
+
+def _rigid_change(method: Method) -> str:
+    """Returns the change of a run with the scene's contacts that makes them rigid."""
+    return "leave out --contact scene" if method.can_be_rigid else SAFE_METHOD
 
 
 def _concern_cause(concerns: Sequence[Concern], where: str) -> Cause | None:
@@ -665,7 +671,7 @@ def _constraint_cause(evidence: Evidence, report: AuditReport, window: slice) ->
         "constraint",
         f"{name} did {format_energy(works[name])} of work in the {WINDOW:g} s before: with the "
         "scene's own contacts it is a spring, whose energy no meter knows",
-        "leave out --contact scene: rigid contacts hold it without a spring",
+        f"{_rigid_change(evidence.method)}: rigid contacts hold it without a spring",
     )
 
 
