@@ -408,6 +408,29 @@ def test_a_contact_that_lies_beside_is_no_cause(contact: str, tmp_path: Path) ->
     assert (cause.kind, "body 'base' turned" in cause.evidence) == ("rate", True)
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_the_contact_that_is_the_cause_is_named_before_those_that_touched_as_long(
+    tmp_path: Path,
+) -> None:
+    path, device = tmp_path / "run.mcap", ScriptedDevice(report_runs.tapping)
+    soft = 'size=".02" mass="1" priority="1" solref=".0005 8"'
+    beside = "".join(
+        f'<body pos="{x} 1 .0199"><freejoint/><geom name="{name}" {soft}/></body>'
+        for x, name in ((1, "one"), (2, "two"))
+    )
+    scene = report_runs.HARD_FLOOR.replace("<worldbody>", f"<worldbody>{beside}")
+    scene = scene.replace('<geom type="plane"', '<geom name="floor" type="plane"')
+    scene = scene.replace('<geom type="sphere"', '<geom name="ball" type="sphere"')
+    options = {"duration": 0.1, "contact": "scene"}
+    report_runs.made_in(path, scene, device, report_runs.LOOSE, **options)
+    cause = cause_of(read_recording(path), audit(path))
+    assert cause.kind == "contact setting"
+    touched = re.search(r"while (geom \S+) touched (geom [^ ,;]+)", cause.evidence)
+    assert touched
+    assert touched.groups() == ("geom 'floor'", "geom 'ball'")
+    assert "the contact of geom 'floor' with geom 'ball' (" in cause.evidence
+
+
 def test_a_body_that_was_moved_slowly_beside_is_no_cause(tmp_path: Path) -> None:
     path, scene = tmp_path / "run.mcap", tmp_path / "fan.xml"
     scene.write_text(

@@ -382,6 +382,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
     share = float(gained[touches].sum() / gained.sum()) if gained.sum() > 0 else 0.0
     where = f"{share:.0%} of the energy created until then came in ticks with contact"
     pairs = touched_pairs(evidence, report, window, gained) if share >= MOST else None
+    share_words = where
     if pairs:
         where += _pair_words(evidence, pairs)
     can_push = _can_push(evidence, pairs, share)
@@ -391,7 +392,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
     cause = cause or _flex_cause(evidence, report, window, gained)
     cause = cause or _jump_cause(evidence, report, window, gained)
     if share >= MOST:
-        cause = cause or _contact_cause(evidence, report, window, pairs, where)
+        cause = cause or _contact_cause(evidence, report, window, pairs, share_words)
         where += ", but contacts did little work"
     cause = cause or _constraint_cause(evidence, report, window)
     return cause or _cause_without_contact(evidence, report, window, where)
@@ -421,7 +422,7 @@ def _inputs_cause(
 
 ALONE = 3
 """Number of pairs of geoms that are tried as the cause one by one, before all of them. Each takes
-another simulation of the run; those with most energy come first."""
+another simulation of the run; those with most work come first."""
 
 
 def _contact_cause(
@@ -440,12 +441,16 @@ def _contact_cause(
             f"{where}; which of them did it shows where the run is simulated again",
             "audit it with the versions that recorded it",
         )
-    suspects = [pair for pair in pairs if not is_rigid and _concerns(evidence, [pair])]
+    works = _contact_works(evidence, window)
+    hardest = sorted(pairs, key=lambda pair: -works.get(pair, 0.0))
+    suspects = [pair for pair in hardest if not is_rigid and _concerns(evidence, [pair])]
     for tried in [*([pair] for pair in suspects[:ALONE]), suspects]:
         change = partial(set_as_suggested, pairs=tried)
         if tried and _is_behind(evidence, report, window, change=change):
-            return _concern_cause(_concerns(evidence, tried), where)
-    work = _contact_work(evidence, window)
+            named = _pair_words(evidence, {tried[0]: pairs[tried[0]]} | pairs)
+            return _concern_cause(_concerns(evidence, tried), where + named)
+    where += _pair_words(evidence, pairs) if pairs else ""
+    work = sum(works.values())
     if work <= MOST * _created_in(evidence, window):
         return None
     usual = "the contacts are set as recommended"
@@ -472,12 +477,11 @@ def _concern_cause(concerns: Sequence[Concern], where: str) -> Cause | None:
     return Cause("contact setting", f"{where}; {concerns[0].words}", f"write {changes}")
 
 
-def _contact_work(evidence: Evidence, window: slice) -> float:
-    """Returns the work in J of all contacts in a window."""
+def _contact_works(evidence: Evidence, window: slice) -> dict[frozenset[int], float]:
+    """Returns the works in J of contacts in a window, by their geoms."""
     if evidence.model is None:
-        return 0.0
-    works = _works(evidence.recording, evidence.model, window, _contact_powers)
-    return sum(works.values())
+        return {}
+    return _works(evidence.recording, evidence.model, window, _contact_powers)
 
 
 def _cause_of_scene(
@@ -687,9 +691,13 @@ def _constraint_powers(data: mujoco.MjData) -> dict[str, float]:
     return found
 
 
-def _contact_powers(data: mujoco.MjData) -> dict[str, float]:
-    """Returns the power in W of all contacts together, as ``_constraint_powers``."""
-    return {"contacts": float(_row_powers(data)[_is_contact(data)].sum())}
+def _contact_powers(data: mujoco.MjData) -> dict[frozenset[int], float]:
+    """Returns the powers in W of contacts by their geoms, as ``_constraint_powers``."""
+    powers, found = _row_powers(data), {frozenset[int](): 0.0}
+    for row in np.flatnonzero(_is_contact(data)).tolist():
+        pair = frozenset(data.contact.geom[data.efc_id[row]].tolist())
+        found[pair] = found.get(pair, 0.0) + float(powers[row])
+    return found
 
 
 def _row_powers(data: mujoco.MjData) -> NDArray[np.float64]:
