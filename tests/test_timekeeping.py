@@ -511,6 +511,12 @@ def test_a_force_that_the_watch_lowered_refutes_a_device_that_is_not_judged() ->
     assert (found.verdict, found.standing) == (False, Standing.ALARM)
 
 
+@pytest.mark.parametrize(("share", "told"), [(1.0, "slow motion"), (0.5, "deadlines were missed")])
+def test_a_scene_is_slow_by_itself_only_beside_a_loop_in_time(share: float, told: str) -> None:
+    slow = replace(kept_time(), scene_rate=500.0, scene_speed=0.5, share=share, is_kept=None)
+    assert told in slow.hint
+
+
 def test_a_silence_of_the_device_is_the_cause_and_not_the_clock() -> None:
     silent = replace(kept_time(), is_kept=False, silence=timekeeping.Silence(1.0, 2.0))
     assert "no new sample for 1 s (at 2.0 s), and the force faded; check its link" in silent.fault

@@ -366,7 +366,7 @@ class Timekeeping:
     @property
     def hint(self) -> str:
         """Sentence that suggests a remedy after missed deadlines or late steps of the scene."""
-        if self.scene_speed < SLOW_MOTION:
+        if self.scene_speed < SLOW_MOTION * self.share:  # a loop that is late slows the scene, too
             return "the scene runs in slow motion: a lower --scene-rate gives its steps more time"
         if self.share == 1.0 or self.is_kept is False:
             return ""

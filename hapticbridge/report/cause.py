@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import mujoco
 import numpy as np
@@ -29,15 +29,13 @@ from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.scene.checks import PUMPING, Pump, may_move, pump_powers, unmetered_work
-from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
-from hapticbridge.scene.fault import weight
+from hapticbridge.scene.contacts import Concern, check_contacts, geom_name, set_as_suggested
 from hapticbridge.scene.handle import constraint_rows, mocap_of
 from hapticbridge.scene.physics import (
     STEADY_WAY,
     TendonWatch,
     jump_behind,
     storing_flex,
-    tool_masses,
     unstored_words,
 )
 from hapticbridge.scene.scene import iteration_limit
@@ -193,18 +191,28 @@ def _unknown_cause(evidence: Evidence) -> Cause:
 
 
 def _timing_cause(evidence: Evidence, window: slice) -> Cause | None:
-    """Returns missed deadlines or repeated samples as the cause; the device bears the coupling."""
+    """Returns missed deadlines or repeated samples as the cause; the device bears the coupling.
+
+    Most of the energy must have come beside them.
+    """
     flags = evidence.ticks["flags"][window]
-    missed = int(np.count_nonzero(flags & int(TickFlag.OVERRUN)))
+    is_late, is_repeated = (
+        (flags & int(flag)) != 0 for flag in (TickFlag.OVERRUN, TickFlag.STALE_SAMPLE)
+    )
+    gained = np.diff(evidence.excess, prepend=0.0)[window].clip(min=0.0)
     span = len(flags) * evidence.parameters.period
-    if missed:
+    late_share = _share_beside(is_late, gained)
+    if late_share >= MOST:
         return Cause(
             "rate",
-            f"ticks late by a period or more in the {format_number(span, 2)} s before: {missed}, "
-            "in each of which the wrench was held for longer",
+            f"{late_share:.0%} of the energy came beside ticks that were late by a period or more "
+            f"({np.count_nonzero(is_late)} in the {format_number(span, 2)} s before), in each of "
+            "which the wrench was held for longer",
             "lower the rate or the load of the machine ('hapticbridge doctor')",
         )
-    repeated = float(np.mean((flags & int(TickFlag.STALE_SAMPLE)) != 0))
+    if _share_beside(is_repeated, gained) < MOST:
+        return None
+    repeated = float(np.mean(is_repeated))
     # a device slower than the loop repeats each sample until its next one
     own = evidence.info.rate
     expected = max(0.0, 1.0 - own * evidence.parameters.period) if own else 0.0
@@ -217,6 +225,13 @@ def _timing_cause(evidence: Evidence, window: slice) -> Cause | None:
             "mend the link to the device, or lower the rate to what it delivers",
         )
     return None
+
+
+def _share_beside(marked: NDArray[np.bool_], gained: NDArray[np.float64]) -> float:
+    """Returns the share of an energy that came in marked ticks or in those next to them, (n,)."""
+    beside = np.convolve(marked, np.ones(3), mode="same")[: len(marked)] > 0.0
+    total = float(gained.sum())
+    return float(gained[beside].sum()) / total if total > 0.0 else 0.0
 
 
 def _quantisation_words(evidence: Evidence, window: slice) -> str:
@@ -252,6 +267,10 @@ def _quantisation_words(evidence: Evidence, window: slice) -> str:
     )
 
 
+REPEATED = (Agreement.EXACT, Agreement.NEAR)
+"""Agreements of a run whose motion can be simulated again."""
+
+
 # Geoms that touched while energy was created
 
 Pairs = dict[frozenset[int], float]
@@ -268,7 +287,7 @@ def touched_pairs(
     """
     if evidence.model is None:
         return None
-    if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
+    if report.agreement not in REPEATED:
         return None
     total = float(gained.sum())
     found: defaultdict[frozenset[int], float] = defaultdict(float)
@@ -289,13 +308,63 @@ def _runs_in(recording: Recording, window: slice) -> Iterator[Resimulator]:
     Raises:
         RecordingError: It cannot be simulated.
     """
-    ticks = recording.ticks
-    run = Resimulator(recording, AuditedRun.of(recording).parameters)
-    for begin in range(0, window.start, BLOCK):
-        run.add(ticks[begin : min(begin + BLOCK, window.start)])
+    run = _run_until(recording, window.start)
     for tick in range(window.start, window.stop):
-        run.add(ticks[tick : tick + 1])
+        run.add(recording.ticks[tick : tick + 1])
         yield run
+
+
+def _run_until(recording: Recording, end: int) -> Resimulator:
+    """Returns a run that was simulated again up to a tick.
+
+    Raises:
+        RecordingError: It cannot be simulated.
+    """
+    run = Resimulator(recording, AuditedRun.of(recording).parameters)
+    for begin in range(0, end, BLOCK):
+        run.add(recording.ticks[begin : min(begin + BLOCK, end)])
+    return run
+
+
+def _is_behind(
+    evidence: Evidence,
+    report: AuditReport,
+    window: slice,
+    *,
+    change: Callable[[mujoco.MjModel], None] = lambda _: None,
+    events: list[dict[str, Any]] | None = None,
+) -> bool:
+    """Returns True if the same motion creates less than half of the energy without a suspect.
+
+    Args:
+        evidence: The run.
+        report: Its audit; a run that was not simulated again there is not here.
+        window: Ticks that count; until then the run stays as it was.
+        change: Takes the suspect out of the scene.
+        events: Events of a run without it; None for the recorded ones.
+    """
+    if report.agreement not in REPEATED:
+        return False
+    recording = evidence.recording
+    if events is not None:
+        recording = replace(recording, events=events)
+    try:
+        run = _run_until(recording, window.start)
+        change(run.model)
+        rows = run.add(recording.ticks[window])
+    except RecordingError:
+        return False
+    if len(rows) < window.stop - window.start:  # it was stopped
+        return False
+    before = float(evidence.created[window.start - 1]) if window.start else 0.0
+    left = float(rows["environment_energy"][-1]) - before
+    return left < (1.0 - MOST) * _created_in(evidence, window)
+
+
+def _created_in(evidence: Evidence, window: slice) -> float:
+    """Returns the energy in J that the scene created in a window, less what it lost there."""
+    before = float(evidence.created[window.start - 1]) if window.start else 0.0
+    return float(evidence.created[window.stop - 1]) - before
 
 
 # Causes of energy created in the environment
@@ -305,64 +374,114 @@ FAST_TURN = 0.02
 rad/s created 0.05 J in a second under a coupling of translation alone (measured). A smaller value
 suspects hands, which turn at 10 rad/s; a larger one misses such cases."""
 
-_SOFTER = "lower the stiffness, raise the rate, or make the contacts softer"
-
 
 def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice) -> Cause:
     """Returns the likely cause of energy created in the environment."""
-    method = evidence.method
     gained = np.diff(evidence.created, prepend=0.0)[window].clip(min=0.0)
     touches = (evidence.ticks["contacts"] > 0)[window]
     share = float(gained[touches].sum() / gained.sum()) if gained.sum() > 0 else 0.0
     where = f"{share:.0%} of the energy created until then came in ticks with contact"
     pairs = touched_pairs(evidence, report, window, gained) if share >= MOST else None
+    share_words = where
     if pairs:
         where += _pair_words(evidence, pairs)
-    if (moved := _moved_bodies(evidence, window)) and _can_push(evidence, pairs, share):
-        work = _input_work(evidence, window)
-        if work > MOST * float(gained.sum()):
-            return Cause(
-                "inputs",
-                f"mocap bodies were moved {moved} times in the {WINDOW:g} s before, and inputs "
-                f"gave and took {format_energy(work)}; {where}; MuJoCo damps their contacts and "
-                "welds against rest, so a fast move creates energy",
-                "move them slower",
-            )
-    own = _cause_of_scene(evidence, report, window, gained, where)
-    own = own or _solver_cause(evidence, window, gained)
-    own = own or _flex_cause(evidence, report, window, gained)
-    if cause := own or _jump_cause(evidence, report, window, gained):
-        return cause
-    if share < MOST:
-        constraint = _constraint_cause(evidence, report, window, gained)
-        return constraint or _cause_without_contact(evidence, report, window, where)
-    if concerns := _concerns(evidence, pairs):
-        first = concerns[0]
-        return Cause("contact setting", f"{where}; {first.words}", f"write {first.change}")
-    if method.hazard:
-        return _method_cause(method, "the contacts are set as recommended; ")
-    light, usual = _light_tool_words(evidence), "the contacts are set as recommended"
-    return Cause("contact setting" if light else "unknown", f"{where}; {light or usual}", _SOFTER)
+    can_push = _can_push(evidence, pairs, share)
+    cause = _inputs_cause(evidence, report, window, gained, where) if can_push else None
+    cause = cause or _cause_of_scene(evidence, report, window, gained, where)
+    cause = cause or _solver_cause(evidence, report, window, gained)
+    cause = cause or _flex_cause(evidence, report, window, gained)
+    cause = cause or _jump_cause(evidence, report, window, gained)
+    if share >= MOST:
+        cause = cause or _contact_cause(evidence, report, window, pairs, share_words)
+        where += ", but contacts did little work"
+    cause = cause or _constraint_cause(evidence, report, window)
+    return cause or _cause_without_contact(evidence, report, window, where)
 
 
-LIGHT = 20.0
-"""Time of a swing of the tool on the coupling, in ticks, below which the tool counts as light. The
-step follows a faster swing badly, so that contacts are hard for it."""
-
-
-def _light_tool_words(evidence: Evidence) -> str:
-    """Describes a tool that swings fast on its coupling, 2π √(m/K); empty for another one."""
-    model, stiffness = evidence.model, evidence.worst.coupling.stiffness
-    if model is None or stiffness <= 0.0:
-        return ""
-    mass = tool_masses(model, evidence.parameters.grip)[0]
-    ticks = 2.0 * math.pi * math.sqrt(mass / stiffness) / evidence.parameters.period
-    if ticks >= LIGHT:
-        return ""
-    return (
-        f"a light tool on a stiff coupling is the hard case: {weight(mass)} swing on "
-        f"{format_number(stiffness)} N/m in {format_number(ticks, 2)} ticks"
+def _inputs_cause(
+    evidence: Evidence,
+    report: AuditReport,
+    window: slice,
+    gained: NDArray[np.float64],
+    where: str,
+) -> Cause | None:
+    """Returns moved mocap bodies as the cause, if little is created where they stand still."""
+    moves, work = _moves_in(evidence, window), _input_work(evidence, window)
+    if not moves or work <= MOST * float(gained.sum()):
+        return None
+    if not _is_behind(evidence, report, window, events=_without(moves, evidence.events)):
+        return None
+    return Cause(
+        "inputs",
+        f"mocap bodies were moved {len(moves)} times in the {WINDOW:g} s before, and inputs gave "
+        f"and took {format_energy(work)}; {where}; MuJoCo damps their contacts and welds against "
+        "rest, so a fast move creates energy",
+        "move them slower",
     )
+
+
+ALONE = 3
+"""Number of pairs of geoms that are tried as the cause one by one, before all of them. Each takes
+another simulation of the run; those with most work come first."""
+
+
+def _contact_cause(
+    evidence: Evidence, report: AuditReport, window: slice, pairs: Pairs | None, where: str
+) -> Cause | None:
+    """Returns contacts as the cause: those that create little with the settings recommended.
+
+    If none does, it is what contacts did, if their work is most of the energy. If the run cannot be
+    simulated again, it is the first concern.
+    """
+    is_rigid = evidence.parameters.is_rigid  # such contacts do not have those settings
+    if pairs is None:
+        concerns = [] if is_rigid else _concerns(evidence, None)[:1]
+        return _concern_cause(concerns, where) or Cause(
+            "unknown",
+            f"{where}; which of them did it shows where the run is simulated again",
+            "audit it with the versions that recorded it",
+        )
+    works = _contact_works(evidence, window)
+    hardest = sorted(pairs, key=lambda pair: -works.get(pair, 0.0))
+    suspects = [pair for pair in hardest if not is_rigid and _concerns(evidence, [pair])]
+    for tried in [*([pair] for pair in suspects[:ALONE]), suspects]:
+        change = partial(set_as_suggested, pairs=tried)
+        if tried and _is_behind(evidence, report, window, change=change):
+            named = _pair_words(evidence, {tried[0]: pairs[tried[0]]} | pairs)
+            return _concern_cause(_concerns(evidence, tried), where + named)
+    where += _pair_words(evidence, pairs) if pairs else ""
+    work = sum(works.values())
+    if work <= MOST * _created_in(evidence, window):
+        return None
+    usual = "the contacts are set as recommended"
+    if suspects:
+        usual = "with the settings recommended they do so, too"
+    did = f"{where}; contacts did {format_energy(work)} of work in the {WINDOW:g} s before"
+    if evidence.method.hazard:
+        return _method_cause(evidence.method, f"{did}; ")
+    if is_rigid:
+        return Cause("unknown", did, "lower the stiffness, or raise the rate")
+    remedy = f"{_rigid_change(evidence.method)}, or lower the stiffness"
+    return Cause("unknown", f"{did}; {usual}", remedy)
+
+
+def _rigid_change(method: Method) -> str:
+    """Returns the change of a run with the scene's contacts that makes them rigid."""
+    return "leave out --contact scene" if method.can_be_rigid else SAFE_METHOD
+
+
+def _concern_cause(concerns: Sequence[Concern], where: str) -> Cause | None:
+    if not concerns:
+        return None
+    changes = "; ".join(dict.fromkeys(each.change for each in concerns))
+    return Cause("contact setting", f"{where}; {concerns[0].words}", f"write {changes}")
+
+
+def _contact_works(evidence: Evidence, window: slice) -> dict[frozenset[int], float]:
+    """Returns the works in J of contacts in a window, by their geoms."""
+    if evidence.model is None:
+        return {}
+    return _works(evidence.recording, evidence.model, window, _contact_powers)
 
 
 def _cause_of_scene(
@@ -377,21 +496,21 @@ def _cause_of_scene(
     This is a pump, or work without a port.
     """
     model, least = evidence.model, MOST * float(gained.sum())
-    if model is None or report.agreement not in (Agreement.EXACT, Agreement.NEAR):
+    if model is None or report.agreement not in REPEATED:
         return None
+    found = list[tuple[float, Cause]]()
     pump, work = _hardest_pump(evidence.recording, model, window)
     # a motor's work is no creation, until its motion is beyond all measure
-    is_creation = pump is not None and (pump.kind == "joint" or report.trip is not None)
-    if pump is not None and is_creation and work > least:
-        return _pump_cause(pump, work, where)
+    if pump is not None and (pump.kind == "joint" or report.trip is not None):
+        found.append((work, _pump_cause(pump, work, where)))
     clauses = unmetered_work(model)
     powers = partial(_unmetered_powers, clauses)
-    works = _works(evidence.recording, model, window, powers)
-    name = max(works, key=lambda each: works[each], default="")
-    if not name or works[name] <= least:
-        return None
-    did = f"{clauses[name]}: {format_energy(works[name])} in the {WINDOW:g} s before"
-    return Cause("unmetered work", f"{did}; {where}", f"remove {name}, or make it weaker")
+    for name, did in _works(evidence.recording, model, window, powers).items():
+        words = f"{clauses[name]}: {format_energy(did)} in the {WINDOW:g} s before; {where}"
+        cause = Cause("unmetered work", words, f"remove {name}, or make it weaker")
+        found.append((did, cause))
+    found = [each for each in found if each[0] > least]
+    return max(found, key=lambda each: each[0])[1] if found else None
 
 
 def _pump_cause(pump: Pump, work: float, where: str) -> Cause:
@@ -469,7 +588,7 @@ def _jump_cause(
     model = evidence.model
     if model is None or not model.ntendon:
         return None
-    if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
+    if report.agreement not in REPEATED:
         return None
     watch = TendonWatch(model)
     try:
@@ -489,23 +608,30 @@ def _jump_cause(
     )
 
 
-def _solver_cause(evidence: Evidence, window: slice, gained: NDArray[np.float64]) -> Cause | None:
-    """Returns the solver as the cause, if most of the energy came where it did not finish."""
+def _solver_cause(
+    evidence: Evidence, report: AuditReport, window: slice, gained: NDArray[np.float64]
+) -> Cause | None:
+    """Returns the solver as the cause, if it creates little with more iterations."""
     model, total = evidence.model, float(gained.sum())
     if model is None or total <= 0.0:
         return None
     limit = iteration_limit(model, is_rigid=evidence.parameters.is_rigid)
     unfinished = evidence.ticks["solver_iterations"][window] >= limit
     share = float(gained[unfinished].sum()) / total
-    if share < MOST:
+    change = partial(_iterate, limit=10 * limit)
+    if share < MOST or not _is_behind(evidence, report, window, change=change):
         return None
     return Cause(
         "solver",
         f"{share:.0%} of the energy created until then came in ticks in which MuJoCo's solver "
-        f"stopped at its limit of {limit} iterations: its forces are not those of the contacts "
-        "and constraints",
+        f"stopped at its limit of {format_count(limit, 'iteration')}: its forces are not those of "
+        "the contacts and constraints",
         f'write <option iterations="{10 * limit}">',
     )
+
+
+def _iterate(model: mujoco.MjModel, limit: int) -> None:
+    model.opt.iterations = limit
 
 
 def _flex_cause(
@@ -515,7 +641,7 @@ def _flex_cause(
     model = evidence.model
     if model is None or not model.nflex:
         return None
-    if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
+    if report.agreement not in REPEATED:
         return None
     try:
         whole = slice(max(window.start - 1, 0), window.stop)
@@ -531,9 +657,7 @@ def _flex_cause(
     return Cause("bottomless flex", unstored_words(model, given), storing_flex(model, step))
 
 
-def _constraint_cause(
-    evidence: Evidence, report: AuditReport, window: slice, gained: NDArray[np.float64]
-) -> Cause | None:
+def _constraint_cause(evidence: Evidence, report: AuditReport, window: slice) -> Cause | None:
     """Returns a soft equality or limit as the cause, if its work is most of the energy.
 
     MuJoCo's own constraint is a spring, whose energy no meter knows.
@@ -541,17 +665,17 @@ def _constraint_cause(
     model, parameters = evidence.model, evidence.parameters
     if model is None or parameters.is_rigid:
         return None
-    if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
+    if report.agreement not in REPEATED:
         return None
     works = _works(evidence.recording, model, window, _constraint_powers)
     name = max(works, key=lambda each: works[each], default="")
-    if not name or works[name] <= MOST * float(gained.sum()):
+    if not name or works[name] <= MOST * _created_in(evidence, window):
         return None
     return Cause(
         "constraint",
         f"{name} did {format_energy(works[name])} of work in the {WINDOW:g} s before: with the "
         "scene's own contacts it is a spring, whose energy no meter knows",
-        "leave out --contact scene: rigid contacts hold it without a spring",
+        f"{_rigid_change(evidence.method)}: rigid contacts hold it without a spring",
     )
 
 
@@ -560,13 +684,30 @@ def _constraint_powers(data: mujoco.MjData) -> dict[str, float]:
 
     They are f·(J q̇), with the forces f and rows J of a step and the mean q̇ of its speeds.
     """
-    speeds = data.qvel - 0.5 * data.model.opt.timestep * data.qacc
-    powers, found = data.efc_force * (constraint_rows(data) @ speeds), {"": 0.0}
-    is_contact = data.efc_type >= mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS.value
-    for row in np.flatnonzero(~is_contact).tolist():
+    powers, found = _row_powers(data), {"": 0.0}
+    for row in np.flatnonzero(~_is_contact(data)).tolist():
         name = constraint_name(data.model, data, row)
         found[name] = found.get(name, 0.0) + float(powers[row])
     return found
+
+
+def _contact_powers(data: mujoco.MjData) -> dict[frozenset[int], float]:
+    """Returns the powers in W of contacts by their geoms, as ``_constraint_powers``."""
+    powers, found = _row_powers(data), {frozenset[int](): 0.0}
+    for row in np.flatnonzero(_is_contact(data)).tolist():
+        pair = frozenset(data.contact.geom[data.efc_id[row]].tolist())
+        found[pair] = found.get(pair, 0.0) + float(powers[row])
+    return found
+
+
+def _row_powers(data: mujoco.MjData) -> NDArray[np.float64]:
+    speeds = data.qvel - 0.5 * data.model.opt.timestep * data.qacc
+    return np.asarray(data.efc_force * (constraint_rows(data) @ speeds))
+
+
+def _is_contact(data: mujoco.MjData) -> NDArray[np.bool_]:
+    first = mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS.value
+    return np.asarray(data.efc_type >= first)
 
 
 def _cause_without_contact(
@@ -606,7 +747,7 @@ def _faster_body(
 ) -> tuple[str, float] | None:
     """Returns the body that turned most in a tick, and by how many rad, if more than ``turned``."""
     model = evidence.model
-    if model is None or report.agreement not in (Agreement.EXACT, Agreement.NEAR):
+    if model is None or report.agreement not in REPEATED:
         return None
     try:
         speeds = [
@@ -631,12 +772,11 @@ def _pair_words(evidence: Evidence, pairs: Pairs) -> str:
     return f", {share:.0%} while {touching}{more}"
 
 
-def _concerns(evidence: Evidence, pairs: Pairs | None) -> list[Concern]:
+def _concerns(evidence: Evidence, pairs: Collection[frozenset[int]] | None) -> list[Concern]:
     """Returns concerns about the contacts that touched; about all contacts if unknown."""
     if evidence.model is None:
         return []
-    only = None if pairs is None else list(pairs)
-    return check_contacts(evidence.model, evidence.parameters.grip, only=only)
+    return check_contacts(evidence.model, evidence.parameters.grip, only=pairs)
 
 
 def _can_push(evidence: Evidence, pairs: Pairs | None, share: float) -> bool:
@@ -650,15 +790,26 @@ def _can_push(evidence: Evidence, pairs: Pairs | None, share: float) -> bool:
     return any(is_driven[geom] for pair in pairs for geom in pair)
 
 
-def _moved_bodies(evidence: Evidence, window: slice) -> int:
-    return sum(
-        event.get("event") == "input"
+def _moves_in(evidence: Evidence, window: slice) -> list[dict[str, Any]]:
+    """Returns the inputs of a window that moved mocap bodies."""
+    return [
+        event
+        for event in evidence.events
+        if event.get("event") == "input"
         and isinstance(event.get("tick"), int)
         and window.start <= event["tick"] < window.stop
-        and "mocap_"
-        in str(event.get("writes"))  # as text, because a damaged event may have any shape
-        for event in evidence.events
-    )
+        and "mocap_" in str(event.get("writes"))  # a damaged event may have any shape
+    ]
+
+
+def _without(moves: list[dict[str, Any]], events: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Returns the events of a run whose mocap bodies stay in place instead of some moves."""
+    return [
+        event | {"writes": [w for w in event["writes"] if not str(w[0]).startswith("mocap_")]}
+        if any(event is move for move in moves)
+        else event
+        for event in events
+    ]
 
 
 def _input_work(evidence: Evidence, window: slice) -> float:
@@ -671,6 +822,33 @@ def _input_work(evidence: Evidence, window: slice) -> float:
 
 
 # Search for the likely cause
+
+MUCH_MORE = 10.0
+"""Growth of the excess in a window, relative to that before the fault, from which on the window is
+searched for a larger cause; no unit."""
+
+MEASURED: tuple[Kind, ...] = (
+    *("contact setting", "pump", "inputs", "unmetered work"),
+    *("jumping tendon", "bottomless flex", "constraint", "solver"),
+)
+"""Causes that are named by what they did, and that a fling by another one cannot pretend."""
+
+
+def _cause_of_most(evidence: Evidence, report: AuditReport, window: slice) -> Cause:
+    """Returns the cause of the fault, or of a window that brought much more, if it is another."""
+    first = cause_in_environment(evidence, report, window)
+    energy, allowed = evidence.judged(report)
+    excess = np.concatenate([np.zeros(1), energy - allowed])
+    begins = np.maximum(np.arange(len(excess)) - round(WINDOW / evidence.parameters.period), 0)
+    growths = excess - excess[begins]
+    end = int(np.argmax(growths))
+    if end <= window.stop or growths[end] < MUCH_MORE * growths[window.stop]:
+        return first
+    larger = cause_in_environment(evidence, report, slice(int(begins[end]), end))
+    if larger.kind not in MEASURED or (larger.kind, larger.remedy) == (first.kind, first.remedy):
+        return first
+    when = f"most came in the {WINDOW:g} s before {evidence.time[end - 1]:.3f} s"
+    return replace(larger, evidence=f"{when}: {larger.evidence}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -730,7 +908,7 @@ def likely_cause(
     try:
         return _cause_in_scene(
             evidence.recording,
-            lambda model: cause_in_environment(replace(evidence, model=model), report, window),
+            lambda model: _cause_of_most(replace(evidence, model=model), report, window),
             in_process,
         )
     except HapticBridgeError:
@@ -748,7 +926,7 @@ def pump_behind_trip(
     trip = None if report.verdict == "active" else report.trip
     if trip is None or not trip.may_be_pumped or recording.hands > 1:
         return None
-    if report.agreement not in (Agreement.EXACT, Agreement.NEAR):
+    if report.agreement not in REPEATED:
         return None
     parameters, end = AuditedRun.of(recording).parameters, recording.count
     window = slice(max(0, end - round(WINDOW / parameters.period)), end)

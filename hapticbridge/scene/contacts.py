@@ -218,6 +218,18 @@ def suggested_solref(timestep: float) -> str:
     return f'solref="{SUGGESTED[0] * timestep:g} {SUGGESTED[1]:g}"'
 
 
+def set_as_suggested(model: mujoco.MjModel, pairs: Collection[frozenset[int]]) -> None:
+    """Sets the contacts between pairs of geoms as recommended, and the cone of all friction."""
+    solref = np.multiply(SUGGESTED, (model.opt.timestep, 1.0))
+    model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    model.opt.o_solref, model.opt.o_solimp = solref, MUJOCO_SOLIMP
+    geoms = sorted({geom for pair in pairs for geom in pair})
+    model.geom_solref[geoms], model.geom_solimp[geoms] = solref, MUJOCO_SOLIMP
+    for pair, both in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True)):
+        if frozenset(map(int, both)) in pairs:
+            model.pair_solref[pair], model.pair_solimp[pair] = solref, MUJOCO_SOLIMP
+
+
 def bounce_of(solref: Sequence[float]) -> float:
     """Returns the coefficient of restitution of a ``solref``; 0 below ``NOTABLE_BOUNCE``."""
     e = float(source_of(restitution)(*map(float, solref[:2])))
