@@ -178,7 +178,7 @@ def test_a_button_of_a_motion_without_buttons_is_refused(tmp_path: Path) -> None
     file = tmp_path / "hand.csv"
     file.write_text(GOOD)
     for options in (hb.BridgeOptions(clutch=0), hb.BridgeOptions(dead_man=0)):
-        with pytest.raises(DeviceError, match="'trajectory' has 0 buttons"):
+        with pytest.raises(DeviceError, match="button 0, and the device 'trajectory' has none"):
             hb.Bridge("point_mass", f"trajectory:{file}", options=options)
 
 
