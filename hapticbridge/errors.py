@@ -6,6 +6,7 @@ traceback and exits with 2 (3 for a safety trip).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
@@ -87,6 +88,10 @@ def nearest(name: str, names: Iterable[str]) -> str:
 
 
 def choices(names: Iterable[str]) -> str:
-    """Lists valid names for an error message: ``'a', 'b'``, or ``none exist``."""
-    listed = ", ".join(f"'{name}'" for name in sorted(names))
+    """Lists valid names for an error message: ``'a_2', 'a_10'``, or ``none exist``."""
+
+    def in_order(name: str) -> str:
+        return re.sub(r"\d+", lambda number: number[0].zfill(20), name)
+
+    listed = ", ".join(f"'{name}'" for name in sorted(names, key=in_order))
     return listed or "none exist"

@@ -158,7 +158,9 @@ def test_what_cannot_influence_the_grip_is_named(tmp_path: Path) -> None:
     assert set(idle) == {"body 'slider'", "body 'block'", "geom 'cap'", "geom 'stop'"}
     assert "never touches the tool" in idle["body 'block'"].reason
     assert idle["geom 'cap'"].reason == inventory.VISUAL
-    assert idle["geom 'stop'"].reason == "fixed and never met in the motion"
+    assert idle["geom 'stop'"].reason == (
+        "fixed, and never met by the tool, nor by what moves it in the motion"
+    )
     assert idle["body 'block'"].place.file == "parts.xml"
 
 

@@ -134,6 +134,13 @@ def test_no_changed_bit_of_a_bag_without_checksums_loses_a_message_unseen(
     assert "is damaged: its index counts 5 messages of /hand, and 4 can be read" in told
 
 
+def test_stamps_that_stand_still_are_told(tmp_path: Path) -> None:
+    messages = [(at, pose_message(10**9, 0.0)) for at, _ in ramp()]
+    (file,) = bag(tmp_path / "walk", {"/hand": messages}).glob("*.mcap")
+    with pytest.raises(DeviceError, match="message 1 of /hand: the stamps stand still: time 0 s a"):
+        read_bag(file)
+
+
 @pytest.mark.parametrize("unset", [[0], [0, 1], [3]])
 def test_some_messages_without_stamps_are_told_and_a_simulated_clock_from_0_is_not(
     tmp_path: Path, unset: list[int]
@@ -471,6 +478,7 @@ def table(steps: float, lengths: float, count: int = 30) -> str:
 
 
 MISTAKEN = [
+    (table(1, 1e6), "spans 19900 m at .*; positions are in m and times in s$"),
     (table(1, 1e3), "spans 19.9 m .* if these are mm, divide them by 1000"),
     (table(1e3, 1e3), "rows 10 s apart, as times in ms have; .* if these are mm"),
     (table(1e9, 1e3), r"rows 10000000 s apart, as times in ns have; .* if these are mm"),
@@ -579,8 +587,15 @@ def test_a_split_bag_is_told_with_what_joins_it(tmp_path: Path) -> None:
     for place in (folder, f"{folder}:/hand"):
         with pytest.raises(DeviceError, match="or let 'ros2 bag convert' write the whole bag into"):
             open_device(f"trajectory:{place}")
-    (folder / "walk_1.mcap").unlink()
     listed = (folder / "metadata.yaml").read_text()
+    (folder / "metadata.yaml").unlink()  # as a recorder that is killed leaves it
+    for number in (2, 10):
+        (folder / f"walk_{number}.mcap").write_bytes(file.read_bytes())
+    in_order = "'walk_1.mcap', 'walk_2.mcap', 'walk_10.mcap', or let 'ros2 bag reindex'"
+    with pytest.raises(DeviceError, match=in_order):
+        open_device(f"trajectory:{folder}")
+    for number in (1, 2, 10):
+        (folder / f"walk_{number}.mcap").unlink()
     assert listed.count(f"- {file.name}\n") == 1
     split = listed.replace(f"- {file.name}\n", f"- {file.name}\n  - walk_1.mcap\n")
     (folder / "metadata.yaml").write_text(split)

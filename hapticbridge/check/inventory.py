@@ -221,6 +221,8 @@ def _idle(
         if use == VISUAL:
             idle.append(Idle(places.find("geom", geom), VISUAL))
         elif not model.nflex and geom not in touched and (group < 0 or group in reached):
-            still = "fixed and never met" if group < 0 else "never meets anything"
+            still = "never meets anything"
+            if group < 0:
+                still = "fixed, and never met by the tool, nor by what moves it"
             idle.append(Idle(places.find("geom", geom), f"{still}{when}"))
     return tuple(idle)

@@ -104,6 +104,8 @@ def _refuse_other_bag(path: Path) -> None:
         one = f"name one of {choices(bags[:8])}"
         if (path / "metadata.yaml").is_file():
             one += ", or let 'ros2 bag convert' write the whole bag into one"
+        elif all(map(_is_bag, map(path.joinpath, bags[:8]))):
+            one += ", or let 'ros2 bag reindex' and 'ros2 bag convert' write the whole bag into one"
         raise DeviceError(f"{path}: a folder of {len(bags)} files; {one}")
     if kind := next(filter(None, map(foreign_kind, files)), ""):
         raise DeviceError(f"{path}: {kind}")
@@ -339,9 +341,10 @@ def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
             if is_slow
             else ""
         )
+        unit = ": if these are mm, divide them by 1000" if span <= 1e3 * MAX_SPAN else ""
         raise DeviceError(
             f"{path}: the motion spans {format_number(span, 3)} m at {format_number(speed, 3)} "
-            f"m/s{also}; positions are in m and times in s: if these are mm, divide them by 1000"
+            f"m/s{also}; positions are in m and times in s{unit}"
         )
     if is_slow:
         warnings.warn(
@@ -531,7 +534,8 @@ def read_bag(path: Path, topic: str = "") -> Motion:
     table[:, 0] = (times - times[0]) * 1e-9
     table[:, 1:] = np.array(numbers)[:, [0, 1, 2, 6, 3, 4, 5]]  # ROS has w last
     if fault := first_fault(table):
-        raise DeviceError(f"{path}, message {fault[0]} of {topic}: {fault[1]}")
+        which = "the stamps stand still: " if any(stamps) and len(set(stamps)) == 1 else ""
+        raise DeviceError(f"{path}, message {fault[0]} of {topic}: {which}{fault[1]}")
     return _plausible(table, path)
 
 
