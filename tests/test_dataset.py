@@ -285,6 +285,39 @@ def test_what_cannot_be_learned_from_is_refused_and_leaves_nothing(
     assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap", "other.mcap", "set"]
 
 
+GAUGE = """
+<mujoco><worldbody>
+  <body name="tool"><freejoint/><geom size="0.01"/><site name="grip"/></body>
+  <body pos="0.1 0 0"><joint name="lever" type="{joint}"/><geom size="0.01"/></body>
+</worldbody><actuator><{actuator} joint="lever" name="drive"/></actuator>
+<sensor><{sensor} name="gauge" joint="lever"/></sensor></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        ("slide", "motor", "jointpos"),
+        ("hinge", "position", "jointpos"),
+        ("hinge", "motor", "jointvel"),
+    ],
+)
+def test_numbers_of_one_name_with_two_meanings_are_no_data_set(
+    other: tuple[str, ...], tmp_path: Path
+) -> None:
+    files = []
+    for name, kinds in [("a", ("hinge", "motor", "jointpos")), ("b", other)]:
+        scene = tmp_path / f"{name}.xml"
+        scene.write_text(
+            GAUGE.format(**dict(zip(("joint", "actuator", "sensor"), kinds, strict=True)))
+        )
+        files.append(scene.with_suffix(".mcap"))
+        with hb.Bridge(scene, clock=hb.SimulatedClock(), recording=files[-1]) as bridge:
+            bridge.run(duration=0.1)
+    with pytest.raises(RecordingError, match=r"b\.mcap' has other joints, actuators or"):
+        write_dataset(files, "lerobot", tmp_path / "set", task="pull")
+    assert write_dataset(files[:1], "lerobot", tmp_path / "set", task="pull").episodes
+
+
 @pytest.mark.parametrize("form", ["lerobot", "robomimic"])
 def test_recordings_of_two_grips_are_no_data_set(form: str, tmp_path: Path) -> None:
     """The state would be the bolt's pose in one episode, and the wrench's in the other."""

@@ -178,8 +178,9 @@ def states(recording: Path, shot: Shot, progress: Progress | None = None) -> dic
 
     Returns:
         ``rows`` (records, (n,)), ``qpos`` (n, nq), ``qvel`` (n, nv), ``ctrl`` (n, nu), ``sensors``,
-        ``names`` of positions, ``controls`` of ``ctrl``, ``sensor_names``, ``odd_readings`` as of
-        ``SensorValues``, and with a camera ``pictures``, a PNG each.
+        ``names`` of positions, ``controls`` of ``ctrl``, ``sensor_names``, ``kinds`` (MuJoCo's
+        types of joints, actuators and sensors), ``odd_readings`` as of ``SensorValues``, and with a
+        camera ``pictures``, a PNG each.
 
     Raises:
         HapticBridgeError: As ``draw``.
@@ -407,8 +408,16 @@ def _states(path: Path, shot: Shot, worker: Worker) -> dict[str, Any]:
         for size in [_POSITIONS[int(model.jnt_type[joint])]]
         for k in range(size)
     ]
+    added = added_actuators(model)
+    own = [each for each in range(len(model.actuator_trntype)) if each not in added]
+    kinds = [
+        model.jnt_type,
+        *(model.actuator_trntype[own], model.actuator_gaintype[own], model.actuator_biastype[own]),
+        model.sensor_type,
+    ]
     return {
         "rows": b"".join(rows),
+        "kinds": [each.tolist() for each in kinds],
         "qpos": qpos,
         "qvel": qvel,
         "ctrl": ctrl,

@@ -74,6 +74,8 @@ class Episode:
         names: Names of the k numbers, by name.
         states: ``qpos`` and ``qvel`` in a row, (n, nq + nv).
         pictures: PNG of each frame, and of the one after the last; none without a camera.
+        kinds: Types of the scene's joints, actuators and sensors; numbers of the same name may mean
+            something else in a scene of others.
         odd: Names of those readings of sensors that the file alone would not give, by the reason.
         repeats: Number of frames that repeat the one before, because deadlines were skipped.
     """
@@ -85,6 +87,7 @@ class Episode:
     names: Mapping[str, tuple[str, ...]]
     states: NDArray[np.float64]
     pictures: tuple[bytes, ...] = field(repr=False)
+    kinds: Sequence[Sequence[int]] = ()
     odd: Mapping[str, list[str]] = field(default_factory=dict)
     repeats: int = 0
 
@@ -157,6 +160,7 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
         names=names,
         states=np.concatenate([found["qpos"], found["qvel"]], axis=1)[:-1],
         pictures=tuple(found["pictures"]),
+        kinds=found["kinds"],
         odd=found["odd_readings"],
         repeats=int(np.sum(np.diff(rows["tick"][:-1]) == 0)),
     )
@@ -599,7 +603,7 @@ def _episodes(
     for recording in recordings:
         episode = episode_of(recording, shot, progress)
         first = first or episode
-        if episode.names != first.names:
+        if (episode.names, episode.kinds) != (first.names, first.kinds):
             raise RecordingError(
                 f"'{recording.path}' has other joints, actuators or sensors than '{first.name}'; "
                 "the episodes of a data set are of one scene"
