@@ -6,6 +6,7 @@ import base64
 import contextlib
 import itertools
 import json
+import os
 import shutil
 import subprocess
 import time
@@ -110,7 +111,12 @@ def browser(folder: Path) -> Iterator[Callable[[], Tab]]:
     client = pytest.importorskip("websockets.sync.client", reason="needs websockets")
     profile = folder / "profile"
     command = [found, *FLAGS, f"--user-data-dir={profile}", "about:blank"]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "XDG_CONFIG_HOME": str(folder)},  # its crash reports
+    )
     sockets = contextlib.ExitStack()
     try:
         address = _address(profile / "DevToolsActivePort", process)
