@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 import pytest
 from audit_cases import recorded
+from cli_cases import Called
 from hypothesis import given
 from hypothesis import strategies as st
 from outside_scenes import RICH, mjcf, obj_bytes, png_bytes, scene_file, stl_bytes
@@ -427,6 +428,26 @@ def test_a_state_written_in_mid_run_is_named_by_the_summary_as_by_the_audit(
         ("unverified", "invalid") if fields else ("passive", "passive")
     )
     assert report.sentence.endswith(f": {words}") or not fields
+
+
+def test_a_trip_behind_a_written_state_is_told_of_the_write_and_of_no_other_cause(
+    call: Called, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    with hb.Bridge("point_mass", clock=hb.SimulatedClock(), recording=path) as bridge:
+
+        def push(tick: int) -> None:
+            if tick > 200:
+                bridge.scene.data.qvel[0] = 0.6
+
+        with pytest.raises(hb.SafetyTrip) as caught:
+            bridge.run(0.6, push)
+    words = "data.qvel of the scene was changed during the run other than by set_input, and no"
+    (told,) = caught.value.__notes__
+    assert told.startswith(words)
+    _, out, _ = call("audit", path)
+    assert f"what to change: {words}" in out
+    assert "itself created" not in out
 
 
 def test_a_scene_painted_in_mid_run_is_the_recorded_one(tmp_path: Path) -> None:

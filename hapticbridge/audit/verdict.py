@@ -49,7 +49,8 @@ from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.format import SHOWN_EVENT
 from hapticbridge.recording.reader import open_hands
 from hapticbridge.run.description import (
-    CHANGED_EVENT,
+    MAX_WORDS,
+    change_in,
     changed_words,
     meta_start,
     requested_of,
@@ -255,9 +256,6 @@ NOTHING_TO_JUDGE = "the recording holds no tick, so there is nothing to judge"
 
 # End of a run
 
-
-MAX_WORDS = 500
-"""Largest number of characters of a text that is read from a foreign file."""
 
 _USUAL_ENDS = ("duration", "signal", "caller", "program", BY_TRIP, None, "")
 
@@ -799,8 +797,8 @@ def _replay_fault(outcome: ReplayOutcome, events: Sequence[Mapping[str, Any]]) -
     if outcome.warning:
         reason = f"simulated again, tick {outcome.tick} is refused: {outcome.warning}"
         return Fault(reason, outcome.tick, outcome.field)
-    changed = next((e.get("fields") for e in events if e.get("event") == CHANGED_EVENT), None)
-    cause = changed_words(str(changed)[:MAX_WORDS] if changed else "")
+    changed = change_in(events)
+    cause = changed_words(changed)
     return Fault(
         f"simulated again, tick {outcome.tick} differs in {outcome.field} by "
         f"{outcome.difference:.3g}: {'' if changed else 'the recording was changed, or '}{cause}",

@@ -33,6 +33,7 @@ from hapticbridge.replay.film import Shot, still
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
 from hapticbridge.report.cause import excess_of, pump_behind_trip
 from hapticbridge.report.evidence import Evidence
+from hapticbridge.run.description import change_in, change_remedy
 from hapticbridge.sweep import Interrupted, Table
 from hapticbridge.units import energy_rows, format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_ifs, write_what_if
@@ -238,6 +239,8 @@ class Audit:
         if cause is not None:
             out.print(f"likely cause: {plain(f'{cause.kind}. {cause.evidence}')}")
             remedy = cause.remedy
+        elif changed := change_in(recording.events):
+            remedy = change_remedy(changed)
         else:
             created = report.energies.get("environment_energy", 0.0)
             remedy = trip.remedy(report.hand_energy, created)

@@ -10,7 +10,7 @@ import json
 import math
 import platform
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from datetime import UTC, datetime
 from functools import cache
@@ -132,6 +132,24 @@ def changed_words(fields: str) -> str:
     """Returns a clause on a change of the scene that no recording holds; ``fields`` or empty."""
     what = f"{fields} of the scene" if fields else "the scene"
     return f"{what} was changed during the run other than by set_input"
+
+
+MAX_WORDS = 500
+"""Largest number of characters of a text that is read from a foreign file."""
+
+
+def change_in(events: Iterable[Mapping[str, Any]]) -> str:
+    """Returns the fields that a program changed as the events tell; empty if none does."""
+    found = (each.get("fields") for each in events if each.get("event") == CHANGED_EVENT)
+    return str(next(found, "") or "")[:MAX_WORDS]
+
+
+def change_remedy(fields: str) -> str:
+    """Returns what to do in place of a change of the scene that nothing metered."""
+    return (
+        f"{changed_words(fields)}, and no meter sees that: give controls, forces and moved mocap "
+        "bodies by set_input, and start a new run for another model or state"
+    )
 
 
 def start_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:

@@ -63,6 +63,7 @@ from hapticbridge.run.commands import CommandExecutor, CommandQueue, EventApplie
 from hapticbridge.run.description import (
     CHANGED_EVENT,
     attachments,
+    change_remedy,
     changed_words,
     describe_hands,
     describe_machine,
@@ -803,7 +804,9 @@ class Session:
         scene = self.setup.scene
         grips = () if cause.is_unsound else (scene.grip, *scene.other_grips)
         pump = working_pump(data, grips) if cause.may_be_pumped else None
-        if pump is not None:
+        if changed := self._changed_fields():
+            trip.add_note(change_remedy(changed))
+        elif pump is not None:
             trip.add_note(f"{pump.words}; write {pump.change}")
         elif remedy := cause.remedy(energy, created, strongest_actuator(model, data)):
             trip.add_note(remedy)
