@@ -528,6 +528,18 @@ def test_a_slow_walk_and_a_few_rows_are_no_mistake(tmp_path: Path) -> None:
     assert read_motion(tmp_path / "hand.csv").duration == pytest.approx(0.29)
 
 
+@pytest.mark.filterwarnings("error")
+def test_poses_in_bursts_are_no_times_in_another_unit(tmp_path: Path) -> None:
+    """A receiver stamps what a network held back: three poses within 6 µs, every 60 ms."""
+    times = [0.06 * (i // 3) + 3e-6 * (i % 3) for i in range(90)]
+    rows = [f"{at:.6f},{1e-3 * i},0,0\n" for i, at in enumerate(times)]
+    (tmp_path / "hand.csv").write_text("t,x,y,z\n" + "".join(rows))
+    assert read_motion(tmp_path / "hand.csv").duration == pytest.approx(1.740006)
+    (tmp_path / "hand.csv").write_text("t,x,y,z\n" + "".join(rows[:30] + rows[45:]))
+    with pytest.warns(UserWarning, match=r"from 0\.54 to 0\.90 s, where poses are 0\.06 s apart"):
+        read_motion(tmp_path / "hand.csv")
+
+
 @pytest.mark.parametrize("is_bag", [False, True])
 def test_a_gap_between_poses_is_told(tmp_path: Path, *, is_bag: bool) -> None:
     """Poses every 10 ms, of which a recorder lost those of 0.5 s, and once those of 0.25 s too."""
