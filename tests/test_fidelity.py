@@ -303,6 +303,26 @@ def test_a_scene_that_diverges_by_itself_has_nothing_to_respect(tmp_path: Path) 
     assert fidelity(diverges, compile_scene(diverges), RunPoint(NO_HAND, PERIOD)) is None
 
 
+TIGHT = """<mujoco><option timestep=".002"/><worldbody>
+<body pos=".3 0 .3"><freejoint/><geom size=".01" mass=".05"/><site name="grip"/></body>
+<body pos="0 0 .3"><joint name="j" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 .1 0 0" size=".008" mass=".05"/></body></worldbody>
+<actuator><velocity joint="j" kv="{}"/></actuator></mujoco>"""
+
+
+def test_that_a_file_gives_nothing_to_compare_with_is_said(call: Called, tmp_path: Path) -> None:
+    """A servo of a gain that MuJoCo's Euler step cannot hold, beside the tool."""
+    text = TIGHT.format(10)
+    assert [each.kind for each in own_motion_faults(open_case(scene(tmp_path, text)))] == [
+        "time step matters"
+    ]
+    command = ("--fast", "--duration", 0.02)
+    code, _, err = call("run", scene(tmp_path, text).path, *command)
+    assert (code, "is compared with nothing" in " ".join(err.split())) == (0, True)
+    code, _, err = call("run", scene(tmp_path, TIGHT.format(0.001)).path, *command)
+    assert (code, "is compared with nothing" in " ".join(err.split())) == (0, False)
+
+
 def test_run_keeps_the_short_step(call: Called, tmp_path: Path) -> None:
     path = scene(tmp_path, FILTER).path
     command = ("run", path, "--fast", "--duration", 0.2)

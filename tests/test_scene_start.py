@@ -330,6 +330,22 @@ def test_a_weight_on_a_chain_that_diverges_is_told_with_what_pulled_before(tmp_p
     assert re.search(r"pulls with up to (1\.0\d kN|9\d\d N),", said), said
 
 
+@pytest.mark.parametrize(("axis", "pulls"), [("0 1 0", False), ("0 1 -.5", True)])
+def test_a_carriage_on_a_level_rail_is_no_load_on_a_tendon(
+    tmp_path: Path, axis: str, *, pulls: bool
+) -> None:
+    text = f"""<mujoco><worldbody><site name="pulley" pos="0 0 1"/>
+      <body name="tool" pos="0 0 .5"><joint type="slide" axis="0 0 1"/>
+        <geom size=".05" mass="1"/><site name="grip"/></body>
+      <body name="carriage" pos="0 .5 1"><joint type="slide" axis="{axis}"/>
+        <geom size=".05" mass="1"/><site name="end"/></body></worldbody>
+      <tendon><spatial range="0 1"><site site="grip"/><site site="pulley"/><site site="end"/>
+      </spatial></tendon></mujoco>"""
+    scene = load_scene(scene_file(tmp_path, text), grip="grip")
+    scene.carry_tool("asked for")
+    assert any("but not that of 'carriage'" in change for change in scene.changes) == pulls
+
+
 def test_parts_welded_to_the_tool_are_carried_with_it_and_loads_on_tendons_are_named(
     tmp_path: Path,
 ) -> None:

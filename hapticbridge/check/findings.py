@@ -20,7 +20,7 @@ from hapticbridge.check.geometry_faults import grip_faults, mesh_faults, workspa
 from hapticbridge.check.mass_faults import mass_faults
 from hapticbridge.check.run_faults import run_faults
 from hapticbridge.errors import choices
-from hapticbridge.run.fidelity import fidelity
+from hapticbridge.run.fidelity import NO_MEASURE, fidelity
 from hapticbridge.scene import compile_scene
 from hapticbridge.scene.checks import (
     MAY_BE_ACTIVE,
@@ -88,6 +88,8 @@ side or its base, and not to the place that was meant."""
 _OF_SUBJECT = {
     "start": APART,
     "weight": 'gravcomp="1" in the bodies of the tool, or less mass',
+    "adhesion": "run with --method implicit, which sees no contact ahead",
+    "joint's gravity compensation": 'gravcomp="0" in the bodies it carries, where it shall not',
     "nested parts": "an <exclude> of their bodies in the file's <contact>",
     "memory": "that memory in <size>, in place of njmax, nconmax and nstack",
 }
@@ -110,11 +112,15 @@ def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     scene = compile_scene(case.source, case.scene.grip, warns=False, checks_start=False)
     found = fidelity(case.source, scene, case.setting)
     place = case.places.option("timestep")
-    if found is not None and found.deviations:
+    if found is None:
+        change = "a time step, gains or limits with which it does not"
+        yield Fault("time step matters", place, NO_MEASURE, change)
+        return
+    if found.deviations:
         change = found.advice(case.setting) or "nothing that was tried mends it"
         kind = "divergence" if math.isinf(found.size) else "own motion"
         yield Fault(kind, place, str(found), change)
-    if found is not None and found.doubt:
+    if found.doubt:
         change = "a shorter time step, with which the places no longer change"
         yield Fault("time step matters", place, found.doubt, change)
 

@@ -48,7 +48,7 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
 from hapticbridge.recording.container import refuse_replacing
 from hapticbridge.run.bridge import Bridge
-from hapticbridge.run.fidelity import own_substeps
+from hapticbridge.run.fidelity import NO_MEASURE, own_substeps
 from hapticbridge.run.hands import Grasp, GripAxis, check_grasps
 from hapticbridge.run.options import (
     AUTO,
@@ -695,9 +695,11 @@ class Run:
                 f"{count} MuJoCo steps per tick keep the file's own time step, without which the "
                 "scene alone would move noticeably differently (--substeps 1 takes one)"
             )
-        elif moved is not None and moved.deviations:
+        elif moved is None:
+            notify(NO_MEASURE)
+        elif moved.deviations:
             notify("; ".join(filter(None, (str(moved), moved.advice(setting)))))
-        elif moved is not None and moved.lost:
+        elif moved.lost:
             notify(moved.doubt)
         return count
 

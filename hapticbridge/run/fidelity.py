@@ -85,6 +85,13 @@ NO_HAND = Coupling(1e-6, 0.0)
 """Coupling that carries nothing: 1 N at 1000 km."""
 
 
+NO_MEASURE = (
+    "without a hand, the scene diverges or fills MuJoCo's limits within 1 s under the file's own "
+    "options, so its motion here is compared with nothing"
+)
+"""Sentence on a scene whose file gives no motion to compare with, ``fidelity`` of which is None."""
+
+
 class Cause(Enum):
     """Replacement of the bridge that makes a scene move differently.
 
@@ -265,7 +272,8 @@ def fidelity(
         max_work: Largest work of one motion (``MAX_WORK``), which shortens it.
 
     Returns:
-        The comparison, or None if the file's own options let the scene diverge.
+        The comparison, or None if the file's own options let the scene diverge, or fill a limit of
+        MuJoCo.
 
     Raises:
         SceneError: The scene does not compile.

@@ -563,14 +563,23 @@ def tied_trees(model: mujoco.MjModel, tree: int) -> list[int]:
     return sorted(tied)
 
 
-def hanging_loads(model: mujoco.MjModel, trees: Sequence[int]) -> list[str]:
-    """Returns the first bodies of other trees that springs or limits of tendons pull at some trees.
+WEIGHTLESS = 1e-6
+"""Generalised force of gravity in N or N m below which a weight pulls at nothing: rounding."""
+
+
+def hanging_loads(data: mujoco.MjData, trees: Sequence[int]) -> list[str]:
+    """Returns the bodies by which the weight of other trees may pull at some trees through tendons.
+
+    The tendons have a spring or a limit. What gravity does not move, such as a carriage on a level
+    rail, has no weight that pulls.
 
     Args:
-        model: The compiled scene.
+        data: The scene at its start, after ``mj_forward``.
         trees: Trees whose weight is carried.
     """
-    names: dict[str, None] = {}
+    model, names = data.model, dict[str, None]()
+    fall = np.abs(data.qfrc_bias - data.qfrc_gravcomp)
+    still = [t for t in range(model.ntree) if not np.any(fall[model.dof_treeid == t] > WEIGHTLESS)]
     for tendon in range(model.ntendon):
         pulls = model.tendon_limited[tendon] or np.any(model.tendon_stiffness[tendon])
         wraps = np.arange(model.tendon_num[tendon]) + model.tendon_adr[tendon]
@@ -578,7 +587,7 @@ def hanging_loads(model: mujoco.MjModel, trees: Sequence[int]) -> list[str]:
         bodies = model.site_bodyid[model.wrap_objid[sites]]
         at = model.body_treeid[bodies]
         if pulls and np.isin(at, trees).any():
-            loads = bodies[~np.isin(at, [*trees, -1])].tolist()
+            loads = bodies[~np.isin(at, [*trees, *still, -1])].tolist()
             names |= {model.body(i).name or str(i): None for i in loads}
     return list(names)
 

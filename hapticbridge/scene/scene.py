@@ -408,10 +408,10 @@ class Scene:
             more = f" and {len(firsts) - 1} more" if len(firsts) > 1 else ""
             name = model.body(firsts[0]).name or firsts[0]
             words += f", with that of what is tied to it, '{name}'{more}"
-        if loads := hanging_loads(model, trees):
+        self.reset()
+        if loads := hanging_loads(self.data, trees):
             words += f", but not that of {choices(loads)} on its tendons"
         self.differences += (SceneChange(words, "weight", reason),)
-        self.reset()
 
     def for_trial(self) -> Scene:
         """Returns a copy with a model and data of its own, whose settings a trial may change."""
