@@ -128,6 +128,19 @@ def test_a_camera_of_an_attached_part_has_a_name_that_learners_take(tmp_path: Pa
     info = json.loads((folder / "meta" / "info.json").read_text())
     assert "observation.images.arm_hand" in info["features"]
     assert not any("/" in name for name in info["features"])
+    frames = lerobot(folder, 0)["observation.images.arm_hand"]
+    pixels = np.array([Image.open(io.BytesIO(frame["bytes"])) for frame in frames]) / 255.0
+    pixels = pixels.reshape(-1, 3)
+    found = json.loads((folder / "meta" / "stats.json").read_text())["observation.images.arm_hand"]
+    right = {name: getattr(pixels, name)(0) for name in ("min", "max", "mean", "std")}
+    for name, share in (("q01", 0.01), ("q10", 0.1), ("q50", 0.5), ("q90", 0.9), ("q99", 0.99)):
+        right[name] = np.quantile(pixels, share, axis=0)
+    assert found.pop("count") == [2]
+    assert {name: np.shape(value) for name, value in found.items()} == dict.fromkeys(
+        right, (3, 1, 1)
+    )
+    for name, values in right.items():
+        np.testing.assert_allclose(np.ravel(found[name]), values, atol=1e-12, err_msg=name)
     write_dataset([tmp_path / "run.mcap"], "robomimic", tmp_path / "other", shot)
     with h5py.File(tmp_path / "other" / "demos.hdf5") as file:
         assert all(isinstance(each, h5py.Dataset) for each in file["data/demo_0/obs"].values())

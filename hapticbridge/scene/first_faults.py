@@ -241,8 +241,11 @@ def friction_faults(case: CompiledScene) -> Iterator[Fault]:
     for dof in np.flatnonzero(model.dof_frictionloss > 0).tolist():
         joint, solref = int(model.dof_jntid[dof]), model.dof_solref[dof]
         solimp, loss = model.dof_solimp[dof], float(model.dof_frictionloss[dof])
-        inertia = joint_inertia(model, case.scene.data, dof)
-        speed = creep_speed(CREEP_LOAD * loss, solref, solimp, inertia)
+        inertia, viscous = joint_inertia(model, case.scene.data, dof), float(model.dof_damping[dof])
+        if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT:  # that of the whole step
+            inertia += case.step * viscous
+        load = CREEP_LOAD * loss
+        speed = creep_speed(load, solref, solimp, inertia, viscous)
         is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
         if joint in reported or speed <= (FASTEST_CREEP if is_slide else FASTEST_TURN):
             continue
@@ -254,7 +257,7 @@ def friction_faults(case: CompiledScene) -> Iterator[Fault]:
             place,
             f"the dry friction of {place.element}, {loss:g} {unit}, creeps by {moved} under half "
             f'of it (solref "{numbers(solref)}", impedance {solimp[0]:g}), where it should hold',
-            _firm_friction(case, CREEP_LOAD * loss, inertia, is_slide=bool(is_slide)),
+            _firm_friction(case, load, inertia, viscous, is_slide=bool(is_slide)),
         )
 
 
@@ -263,11 +266,15 @@ FIRM_IMPEDANCES = 0.999, 0.9999
 
 
 def creep_speed(
-    force: float, solref: Sequence[float], solimp: Sequence[float], inertia: float
+    force: float,
+    solref: Sequence[float],
+    solimp: Sequence[float],
+    inertia: float,
+    viscous: float = 0.0,
 ) -> float:
     """Returns the creep speed of dry friction under a force below the friction, in m/s.
 
-        v = F (1 − d) d_w timeconst/(2 d m)
+        v = F/(b + 2 d m/((1 − d) d_w timeconst))
 
     with the impedance d at depth zero and d_w beyond the width of ``solimp``.
 
@@ -276,23 +283,26 @@ def creep_speed(
         solref: (timeconst in s, dampratio), or (−stiffness in 1/s², −damping in 1/s).
         solimp: MuJoCo's five impedance parameters.
         inertia: m in kg that the joint moves; kg m² for a hinge.
+        viscous: Damping b in N s/m of the joint; N m s/rad for a hinge.
     """
     impedance, last = impedance_at(solimp, 0.0), impedance_at(solimp, np.inf)
     damping = 2.0 / solref[0] if solref[0] > 0 else -float(solref[1])
-    return force * (1.0 - impedance) * last / (impedance * inertia * damping)
+    return force / (viscous + impedance * inertia * damping / ((1.0 - impedance) * last))
 
 
-def _firm_friction(case: CompiledScene, force: float, inertia: float, *, is_slide: bool) -> str:
+def _firm_friction(
+    case: CompiledScene, force: float, inertia: float, viscous: float, *, is_slide: bool
+) -> str:
     """Returns settings of a joint with which dry friction holds a force, as they are written."""
     solref = REFERENCE_STEPS * case.step, 1.0
     fastest = FASTEST_CREEP if is_slide else FASTEST_TURN
     for impedance in FIRM_IMPEDANCES:
         solimp = impedance, impedance, 0.001
-        speed = creep_speed(force, solref, solimp, inertia)
+        speed = creep_speed(force, solref, solimp, inertia, viscous)
         change = f'solreffriction="{reference(case)}" solimpfriction="{numbers(solimp)}"'
         if speed <= fastest:
             return change
-    lacking = 1.01 * inertia * (speed / fastest - 1.0)
+    lacking = 1.01 * inertia * ((force / fastest - viscous) / (force / speed - viscous) - 1.0)
     unit = "kg" if is_slide else "kg m²"
     return f'{change} armature="{lacking:.2g}" ({unit} of inertia, which the hand feels)'
 
