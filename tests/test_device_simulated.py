@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli_cases import Called
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -543,6 +544,32 @@ def test_a_hand_bears_the_whole_weight_of_a_tool_beside_its_centre_of_mass(tmp_p
         <geom size=".02" pos=".12 0 0" mass=".3"/><site name="grip"/></body></worldbody></mujoco>"""
     )
     assert hand_for(load_scene(path)).stiffness == pytest.approx(600.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("hands", [("grip",), ("grip", "other")])
+def test_a_hand_that_feels_no_weight_is_no_firmer(
+    call: Called, tmp_path: Path, hands: tuple[str, ...]
+) -> None:
+    path = tmp_path / "weight.xml"
+    path.write_text(
+        """<mujoco><worldbody>
+        <body><freejoint/><geom size=".03" mass=".5"/><site name="grip"/></body>
+        <body pos="1 0 0"><freejoint/><geom size=".03" mass=".5"/><site name="other"/></body>
+        </worldbody></mujoco>"""
+    )
+    held = [word for grip in hands for word in ("--hand", f"{grip}=simulated")]
+    held = held if len(hands) > 1 else ["--grip", "grip"]
+    words = ("run", path, "--fast", "--duration", 0.02, *held)
+    for more, is_firmer in (((), True), (("--no-tool-weight",), False)):
+        code, _, err = call(*words, *more)
+        assert code == 0
+        assert ("grips with 981 N/m instead of 135" in err) == is_firmer
+        scene = load_scene(path, grip="grip")
+        options = hb.BridgeOptions(tool_weight=is_firmer)
+        with hb.Bridge(scene, clock=hb.SimulatedClock(), options=options) as bridge:
+            assert isinstance(bridge.device, SimulatedDevice)
+            assert isinstance(bridge.device.hand, Hand)
+            assert (bridge.device.hand.stiffness > 135.0) == is_firmer
 
 
 def test_a_hand_holds_a_hinged_bar_by_force_and_turn_as_its_springs_share_them(

@@ -111,7 +111,7 @@ def test_contacts_are_named_where_they_are_the_cause_and_undone_where_that_mends
     nameless = str(moved(scene(tmp_path, SINKING.replace(' name="ball"', ""))))
     assert "the contact of body 'world' and body '1'" in nameless
     assert "--contact scene (tried: " in found.advice(RunPoint(NO_HAND, PERIOD))
-    assert "rigid contacts in place of the file's own" in str(found)
+    assert "rigid contacts, limits and equalities in place of the file's own" in str(found)
 
 
 SERVO = """<mujoco><option timestep="0.001"/><worldbody>
@@ -128,7 +128,10 @@ SERVO = """<mujoco><option timestep="0.001"/><worldbody>
 def test_two_causes_of_which_neither_makes_half_are_both_named(tmp_path: Path) -> None:
     found = moved(scene(tmp_path, SERVO))
     assert set(found.causes) == {Cause.OPTIONS, Cause.CONTACT}
-    assert "rigid contacts in place of the file's own, here of joint equality" in str(found)
+    assert (
+        "rigid contacts, limits and equalities in place of the file's own, here of joint equality"
+        in str(found)
+    )
     # in MuJoCo the options alone leave more than a quarter of the angle, and less than all of it
     ends = []
     for integrator in ("Euler", "discrete"):

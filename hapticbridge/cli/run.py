@@ -56,6 +56,7 @@ from hapticbridge.run.options import (
     USUAL_RATE,
     BridgeOptions,
     RunSetup,
+    held_scene,
     steady_rotational_stiffness,
     steady_stiffness,
 )
@@ -513,7 +514,7 @@ class Run:
             joint = self._own_grip_axis(scene)
             if not joint:
                 self._refuse_grip_scale()
-            device = device_for(scene, self.device, notify, joint)
+            device = device_for(held_scene(scene, self.options), self.device, notify, joint)
             # what is refused from here on must not leave it claimed
             stack.callback(checked(device).close)
             refuse_without_hand(self.options, [device.info])
@@ -653,7 +654,7 @@ class Run:
             self._warn_of_faults(source, scene)
         grasps, infos = [], []
         for grip, joint, name in held:
-            own = scene.of_hand(grips.index(grip))
+            own = held_scene(scene, self.options).of_hand(grips.index(grip))
             opened = device_for(own, name, notify, joint)
             stack.callback(opened.close)
             infos.append(opened.info)

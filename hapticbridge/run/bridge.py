@@ -50,6 +50,7 @@ from hapticbridge.run.options import (
     RunSetup,
     Workspace,
     device_for_run,
+    held_scene,
 )
 from hapticbridge.run.request import RunRequest
 from hapticbridge.run.session import OnTick, Session, StopRequest
@@ -164,7 +165,8 @@ class Bridge:
                 f"one device holds one; name a Grasp per hand, or load it with one of {grips}"
             )
         grasp = Grasp(loaded.grip, device, coupling=coupling)
-        with device_for_run(loaded, device, self.clock) as self.device:
+        held = held_scene(loaded, options)
+        with device_for_run(held, device, self.clock) as self.device:
             return self._requested(loaded, [grasp], [self.device], options)
 
     def _resolve_hands(
@@ -179,7 +181,7 @@ class Bridge:
         if coupling is not None:
             raise HapticBridgeError("each of several hands has a coupling of its own: Grasp(…)")
         loaded = scene_of_grasps(scene, grasps)
-        with devices_for_run(loaded, grasps, self.clock) as devices:
+        with devices_for_run(held_scene(loaded, options), grasps, self.clock) as devices:
             setups = self._requested(loaded, grasps, devices, options)
         self.device = DeviceGroup(devices, [len(grasp.grips) for grasp in grasps])
         return setups

@@ -99,7 +99,7 @@ class Cause(Enum):
     """
 
     TIME_STEP = "the time step"
-    CONTACT = "rigid contacts in place of the file's own"
+    CONTACT = "rigid contacts, limits and equalities in place of the file's own"
     DIAGONAL = "flag diagexact, which rigid contacts need"
     LOAD = "what is changed in the scene as it is loaded"
     OPTIONS = "the integrator or the solver's options"

@@ -388,6 +388,11 @@ PRESCRIBED_MOTION = DeviceInfo(
 """Data sheet of a motion without a device, for studies; it does not react to any force."""
 
 
+def held_scene(scene: Scene, options: BridgeOptions) -> Scene:
+    """Returns the scene with the weight that the hand will feel, for the choice of a hand."""
+    return scene if options.tool_weight or scene.is_carried else scene.with_tool_carried()
+
+
 @contextmanager
 def device_for_run(
     scene: Scene, device: Device | str, clock: Clock, grip_axis: str = ""
