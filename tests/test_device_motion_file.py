@@ -478,6 +478,12 @@ def table(steps: float, lengths: float, count: int = 30) -> str:
 
 
 MISTAKEN = [
+    (
+        "t,x,y,z\n1403636580838555648,0,0,0\n1403636580843555648,0,0,0\n",
+        r"line 2: t = 1\.40364e\+18 is beyond ±1e\+12; times are in s, and .* a clock in ns$",
+    ),
+    ("t,x,y,z\n0,0,0,0\n1764583399000,0,0,0\n", r"line 3: t = .* and this is one of .* in ms$"),
+    ("t,x,y,z\n0,0,0,0\n1,1e13,0,0\n", r"line 3: x = 1e\+13 is beyond ±1e\+12$"),
     (table(1, 1e6), "spans 19900 m at .*; positions are in m and times in s$"),
     (table(1, 1e3), "spans 19.9 m .* if these are mm, divide them by 1000"),
     (table(1e3, 1e3), "rows 10 s apart, as times in ms have; .* if these are mm"),

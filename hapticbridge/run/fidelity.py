@@ -233,7 +233,8 @@ class Fidelity:
             return ""
         return (
             f"{_flags(self.remedy, setting)} (tried: each body is then within "
-            f"{format_si(PLACE, 'm')}, and a still hand bears {format_si(self.more, 'N')} more)"
+            f"{format_si(PLACE, 'm')}, and the largest force on a still hand grows by "
+            f"{format_si(self.more, 'N')})"
         )
 
 
