@@ -92,17 +92,17 @@ _OF_SUBJECT = {
     "joint's gravity compensation": 'gravcomp="0" in the bodies it carries, where it shall not',
     "nested parts": "an <exclude> of their bodies in the file's <contact>",
     "memory": "that memory in <size>, in place of njmax, nconmax and nstack",
+    "only keyframe": f'name="{START_KEYFRAME}" in that <key>',
+    "servos": "those targets as ctrl in that <key>",
 }
 """Ways to make a change in the file that is more than a new value."""
 
 
 def _instead(treatment: Treatment) -> str:
-    """Returns how a run goes without a change, or how the change is no news."""
+    """Returns how a run goes without a change that no file can make needless."""
     if treatment.is_rigid:
         return "run with --contact scene, which keeps it"
-    if treatment.stops:
-        return "run --as-is, which refuses the scene"
-    return "the new value in the file, where this line is then left out"
+    return "run --as-is, which refuses the scene"
 
 
 def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
