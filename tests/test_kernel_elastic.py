@@ -16,8 +16,8 @@ import hapticbridge as hb
 from hapticbridge.audit import audit
 from hapticbridge.audit.replay import Agreement
 from hapticbridge.recording import read_recording
-from hapticbridge.report.cause import likely_cause
 from hapticbridge.report.evidence import Evidence
+from hapticbridge.report.search import likely_cause
 from hapticbridge.run.commands import Reset
 from hapticbridge.scene.physics import gradientless_flexes, storing_flex, unstored_words
 

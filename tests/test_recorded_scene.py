@@ -35,8 +35,8 @@ from hapticbridge.errors import CouplingError, HapticBridgeError, RecordingError
 from hapticbridge.recording import Recording, RecordingFile, open_recording, read_recording
 from hapticbridge.recording.container import MAX_RATIO
 from hapticbridge.replay.film import Shot, still
-from hapticbridge.report.cause import likely_cause
 from hapticbridge.report.evidence import Evidence
+from hapticbridge.report.search import likely_cause
 from hapticbridge.run.description import SOURCE_PREFIX
 from hapticbridge.scene.source import refuse_outside
 from hapticbridge.whatif import what_if
@@ -193,7 +193,7 @@ def test_a_reports_cause_is_found_in_a_child_and_without_a_scene_if_that_dies(
     evidence = Evidence.of(recording)
     assert evidence is not None
     report = replace(audit(path), verdict="active", port="environment", tick=250)
-    monkeypatch.setattr("hapticbridge.report.cause.compile_recorded", crash)
+    monkeypatch.setattr("hapticbridge.report.search.compile_recorded", crash)
     assert likely_cause(evidence, report) is not None
 
 

@@ -35,11 +35,7 @@ from hapticbridge.kernel.parameters import DAMPER
 from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.report import write_report
-from hapticbridge.report.cause import (
-    Cause,
-    likely_cause,
-    pump_behind_trip,
-)
+from hapticbridge.report.cause import Cause
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.page import (
     MAX_EVENTS,
@@ -57,6 +53,7 @@ from hapticbridge.report.plots import (
     draw_recording,
     draw_timing,
 )
+from hapticbridge.report.search import likely_cause, pump_behind_trip
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.units import format_si
 

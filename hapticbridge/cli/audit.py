@@ -31,8 +31,8 @@ from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.recording.reader import read_hands
 from hapticbridge.replay.film import Shot, still
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
-from hapticbridge.report.cause import excess_of, pump_behind_trip
 from hapticbridge.report.evidence import Evidence
+from hapticbridge.report.search import excess_of, pump_behind_trip
 from hapticbridge.run.description import change_in, change_remedy
 from hapticbridge.sweep import Interrupted, Table
 from hapticbridge.units import energy_rows, format_energy

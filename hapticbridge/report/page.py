@@ -24,7 +24,6 @@ from hapticbridge.kernel.restitution import BLOW_SPEED
 from hapticbridge.plotting import inline_svg
 from hapticbridge.recording import Recording
 from hapticbridge.recording.format import SHOWN_EVENT
-from hapticbridge.report.cause import excess_of, pump_behind_trip
 from hapticbridge.report.evidence import Blow, Evidence, blows_of
 from hapticbridge.report.plots import (
     activities,
@@ -34,6 +33,7 @@ from hapticbridge.report.plots import (
     draw_recording,
     draw_timing,
 )
+from hapticbridge.report.search import excess_of, pump_behind_trip
 from hapticbridge.run.description import meta_float
 from hapticbridge.units import energy_rows, format_energy, format_share, format_si, format_wrenches
 

@@ -17,8 +17,8 @@ from hapticbridge.demand.guard import UNLIMITED
 from hapticbridge.device import Device
 from hapticbridge.files import atomic_write
 from hapticbridge.recording import read_recording
-from hapticbridge.report.cause import excess_of
 from hapticbridge.report.evidence import Evidence
+from hapticbridge.report.search import excess_of
 from hapticbridge.run.bridge import Bridge
 from hapticbridge.run.options import BridgeOptions
 from hapticbridge.scene import Scene
