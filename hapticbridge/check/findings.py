@@ -93,7 +93,7 @@ _OF_SUBJECT = {
     "nested parts": "an <exclude> of their bodies in the file's <contact>",
     "memory": "that memory in <size>, in place of njmax, nconmax and nstack",
     "only keyframe": f'name="{START_KEYFRAME}" in that <key>',
-    "servos": "those targets as ctrl in that <key>",
+    "servos": "the pose as ctrl in that <key>",
 }
 """Ways to make a change in the file that is more than a new value."""
 

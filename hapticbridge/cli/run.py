@@ -652,10 +652,9 @@ class Run:
         with working("trying the scene"), compiling(self.scene):
             scene = compile_scene(source, grips, as_is=self.as_is)
             self._warn_of_faults(source, scene)
-        grasps, infos = [], []
+        grasps, infos, felt = [], [], held_scene(scene, self.options)
         for grip, joint, name in held:
-            own = held_scene(scene, self.options).of_hand(grips.index(grip))
-            opened = device_for(own, name, notify, joint)
+            opened = device_for(felt.of_hand(grips.index(grip)), name, notify, joint)
             stack.callback(opened.close)
             infos.append(opened.info)
             grasps.append(self._grasp(grip, joint, opened))

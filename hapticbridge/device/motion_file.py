@@ -24,7 +24,7 @@ from hapticbridge.arguments import number_from
 from hapticbridge.device.base import USUAL_SPEED_LIMIT
 from hapticbridge.device.trajectory import (
     ORIENTATION,
-    SMALLER,
+    PER_SECOND,
     TIME_AND_POSITION,
     Motion,
     first_fault,
@@ -331,9 +331,9 @@ def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
     steps, ways = np.diff(table[:, 0]), np.linalg.norm(np.diff(table[:, 1:4], axis=0), axis=1)
     span = float(np.ptp(table[:, 1:4], axis=0).max())
     step = float(np.median(steps))
-    unit = next((unit for unit, count in SMALLER.items() if step < MAX_STEP * count), "ns")
+    unit = next((unit for unit, count in PER_SECOND.items() if step < MAX_STEP * count), "ns")
     is_slow = len(table) >= MANY_ROWS and step >= MAX_STEP
-    speed = float(np.median(ways / steps)) * (SMALLER[unit] if is_slow else 1.0)
+    speed = float(np.median(ways / steps)) * (PER_SECOND[unit] if is_slow else 1.0)
     if span > MAX_SPAN and speed > USUAL_SPEED_LIMIT:
         also = (
             f", and rows {format_number(step, 3)} s apart, as times in {unit} have"
@@ -349,7 +349,7 @@ def _plausible(table: NDArray[np.float64], path: Path) -> Motion:
         warnings.warn(
             f"{path}: rows are {format_number(step, 3)} s apart, and the motion takes "
             f"{np.ptp(table[:, 0]):.3g} s; times are in s: if these are {unit}, divide by "
-            f"{SMALLER[unit]:.0f}",
+            f"{PER_SECOND[unit]:.0f}",
             stacklevel=3,
         )
     elif len(table) >= MANY_ROWS and (mean := float(steps.mean())) < MIN_STEP:

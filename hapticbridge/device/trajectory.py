@@ -103,7 +103,7 @@ class Motion:
         )
 
 
-SMALLER = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
+PER_SECOND = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
 """Number of these units of time in 1 s."""
 
 
@@ -116,7 +116,7 @@ def first_fault(table: NDArray[np.float64]) -> tuple[int, str] | None:
         column = int(np.argmin(is_good[row]))
         name, value = (TIME_AND_POSITION + ORIENTATION)[column], float(table[row, column])
         fault = f"is beyond ±{MAX_NUMBER:g}" if np.isfinite(value) else "is not finite"
-        for unit, count in SMALLER.items():
+        for unit, count in PER_SECOND.items():
             if name == "t" and 1e8 * count < value < 4e9 * count:  # from 1973 to 2096
                 fault += f"; times are in s, and this is one of a clock in {unit}"
         faults.append((row, f"{name} = {value:g} {fault}"))

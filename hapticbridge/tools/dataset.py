@@ -240,7 +240,6 @@ class LeRobotWriter:
                 size = values.shape[1]
                 columns[name] = arrow.FixedSizeListArray.from_arrays(columns[name], size)
             self._numbers.setdefault(name, []).append(values)
-        colours = np.zeros((256, 3), np.int64)
         if own := episode.pictures[:count]:
             key = f"observation.images.{_label(self._shot)}"
             pictures = [
@@ -248,15 +247,14 @@ class LeRobotWriter:
             ]
             kind = arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])
             columns[key] = arrow.array(pictures, kind)
-            colours = _colours(own)
-            self._colours.setdefault(key, np.zeros_like(colours))
-            self._colours[key] += colours
         self._features = self._features or self._describe(episode)
         chunk, file = divmod(number, _FILES_PER_CHUNK)
         self._write(_DATA.format(chunk_index=chunk, file_index=file), columns)
         stats = {name: _statistics(values, count) for name, values in numbers.items()}
         if own:
+            colours = _colours(own)
             stats[key] = _statistics_of_pictures(colours, count)
+            self._colours[key] = self._colours.get(key, 0) + colours
         self._episodes.append(
             {
                 "episode_index": number,
