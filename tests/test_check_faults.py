@@ -210,8 +210,14 @@ def test_meshes_are_named_unless_the_run_corrects_their_normals(
     text = text.replace("<asset>", f'<asset><mesh name="prism" vertex="{vertices}"/>', 1)
     scene = tmp_path / "prism.xml"
     scene.write_text(text, encoding="utf-8")
-    found = {fault.kind for fault in shape_faults(replace(case_of(scene), contact=contact))}
+    case = replace(case_of(scene), contact=contact)
+    found = {fault.kind: fault.change for fault in shape_faults(case)}
     assert ("mesh faces" in found) == is_named
+    if is_named:
+        now = f"at most 128 corners and as many faces (now {corners} and {corners // 2 + 2})"
+        assert found["mesh faces"].partition(now)[2] == (
+            "" if contact == "rigid" else " and --contact rigid for the run"
+        )
 
 
 def test_peg_sinks_deeper_than_its_clearance_with_mujocos_default(tmp_path: Path) -> None:

@@ -98,8 +98,8 @@ def shape_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         if kinds == {_FLAT[0]} and not case.is_rigid:
             boxes.append((first, second))
         is_flat = kinds <= {*_FLAT} and _FLAT[1] in kinds
-        corners = max(_corners(model, first), _corners(model, second))
-        if is_flat and (not case.is_rigid or corners > MAX_VERTICES):
+        parts = (*_corners_and_faces(model, first), *_corners_and_faces(model, second))
+        if is_flat and (not case.is_rigid or max(parts) > MAX_VERTICES):
             meshes.append((first, second))
     if boxes:
         yield Fault(
@@ -110,14 +110,16 @@ def shape_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             "--contact rigid for the run, whose boxes keep all points",
         )
     if meshes:
-        count = max(_corners(model, geom) for pair in meshes for geom in pair)
+        counts = [_corners_and_faces(model, geom) for pair in meshes for geom in pair]
+        corners, faces = (max(each) for each in zip(*counts, strict=True))
+        also = "" if case.is_rigid else " and --contact rigid for the run"
         yield Fault(
             "mesh faces",
             case.places.find("geom", _tool_geom(meshes[0], is_tool)),
             f"{pair_names(case, meshes)} meet with the normal of either face, up to 84 mrad off "
             "the one that is touched; a tilted tool without friction sank 2.5 mm in that way",
-            f"boxes, spheres and capsules instead, or meshes of at most {MAX_VERTICES} corners "
-            f"(now {count}) and --contact rigid for the run",
+            f"boxes, spheres and capsules instead, or meshes of at most {MAX_VERTICES} corners and "
+            f"as many faces (now {corners} and {faces}){also}",
         )
 
 
@@ -125,12 +127,12 @@ def _tool_geom(pair: tuple[int, int], is_tool: np.ndarray) -> int:
     return pair[0] if is_tool[pair[0]] else pair[1]
 
 
-def _corners(model: mujoco.MjModel, geom: int) -> int:
-    """Returns the number of corners or faces of a mesh geom, the larger one; 8 for others."""
+def _corners_and_faces(model: mujoco.MjModel, geom: int) -> tuple[int, int]:
+    """Returns the numbers of corners and of faces of a mesh geom; those of a box for others."""
     if model.geom_type[geom] != _FLAT[1]:
-        return 8
+        return 8, 6
     mesh = int(model.geom_dataid[geom])
-    return int(max(model.mesh_vertnum[mesh], model.mesh_polynum[mesh]))
+    return int(model.mesh_vertnum[mesh]), int(model.mesh_polynum[mesh])
 
 
 def push_of(case: SceneUnderCheck) -> float:
