@@ -27,6 +27,7 @@ from check_scenes import (
     shipped_case,
     written,
 )
+from cli_cases import Called
 from outside_scenes import hand_rows, mjcf
 from report_runs import HARD_FLOOR
 
@@ -46,9 +47,10 @@ from hapticbridge.demand.rehearsal import RunPoint
 from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.description import model_digest
 from hapticbridge.scene import compile_scene, read_scene, scene_names, scene_path
 from hapticbridge.scene.fault import Fault, length, number, weight
-from hapticbridge.scene.first_faults import worst_faults
+from hapticbridge.scene.first_faults import DROPPED, worst_faults
 from hapticbridge.scene.physics import depth_under
 from hapticbridge.scene.source_map import Place
 
@@ -1231,3 +1233,31 @@ def test_a_contact_sensor_that_finds_contacts_ahead_is_told(tmp_path: Path) -> N
     found = faults_in(tmp_path, mjcf(GOOD_OPTION, GOOD_CONTACT, sensors, body=body))
     told = [fault.place.element for fault in found if fault.kind == "contact sensor"]
     assert told == ["contact 'touches'", "contact 'first'"]
+
+
+BLOCK = """<robot name="block">
+<link name="world"><collision><geometry><box size="1 1 .1"/></geometry></collision></link>
+<joint name="free" type="floating"><origin xyz="0 0 .2"/><parent link="world"/>
+<child link="block"/></joint>
+<link name="block"><inertial><mass value="0.2"/>
+<inertia ixx="2e-4" ixy="0" ixz="0" iyy="2e-4" iyz="0" izz="2e-4"/></inertial>
+<collision><geometry><box size=".085 .085 .085"/></geometry></collision>
+{}</link></robot>"""
+
+
+@pytest.mark.parametrize("tag", DROPPED)
+def test_what_mujoco_does_not_read_in_a_urdf_is_told(
+    call: Called, tmp_path: Path, tag: str
+) -> None:
+    plain, told = tmp_path / "plain.urdf", tmp_path / "told.urdf"
+    plain.write_text(BLOCK.format(""))
+    told.write_text(BLOCK.format(f'<{tag}><lateral_friction value="20"/><mu1 value="20"/></{tag}>'))
+    models = [mujoco.MjModel.from_xml_path(str(path)) for path in (plain, told)]
+    assert model_digest(models[0]) == model_digest(models[1])
+    words = f"MuJoCo does not read <{tag}> of a URDF"
+    for path in (plain, told):
+        for command in ("check", "run"):
+            more = ("--fast", "--duration", 0.02) if command == "run" else ()
+            code, out, err = call(command, path, "--grip", "block", *more)
+            assert code == 0
+            assert (words in " ".join((out + err).split())) == (path == told)

@@ -37,6 +37,7 @@ from hapticbridge.scene.first_faults import (
     motor_faults,
     pump_faults,
     unit_faults,
+    urdf_faults,
 )
 from hapticbridge.scene.physics import OWN_VERTICES, gradientless_flexes
 from hapticbridge.scene.treatment import Treatment
@@ -183,6 +184,7 @@ _FORCE_SENSORS = {
 # Rules by which a scene is judged
 
 RULES = (
+    urdf_faults,
     option_faults,
     own_motion_faults,
     keyframe_faults,

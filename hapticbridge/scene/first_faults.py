@@ -16,7 +16,8 @@ from hapticbridge.scene.fault import CompiledScene, Fault, length, number, numbe
 from hapticbridge.scene.load import SceneSource
 from hapticbridge.scene.physics import joint_inertia, tool_masses
 from hapticbridge.scene.scene import Scene
-from hapticbridge.scene.source_map import Places
+from hapticbridge.scene.source import read_elements
+from hapticbridge.scene.source_map import Place, Places
 
 
 def pump_faults(case: CompiledScene) -> Iterator[Fault]:
@@ -312,9 +313,32 @@ def reference(case: CompiledScene) -> str:
     return f"{REFERENCE_STEPS * case.step:g} 1"
 
 
+# Elements of a URDF that MuJoCo's reader drops
+
+DROPPED = ("contact", "gazebo", "transmission", "safety_controller", "sensor", "loop_joint")
+"""Elements of a URDF that MuJoCo does not read, whatever they hold."""
+
+
+def urdf_faults(case: CompiledScene) -> Iterator[Fault]:
+    """Yields a fault if the scene is a URDF with elements that MuJoCo drops."""
+    source = case.source.sources[0]
+    first, *elements = read_elements(source.data)
+    dropped = [each for each in elements if each.tag in DROPPED]
+    if first.tag != "robot" or not dropped:
+        return
+    tags = " and ".join(dict.fromkeys(f"<{each.tag}>" for each in dropped))
+    yield Fault(
+        "URDF",
+        Place(source.name, dropped[0].line, f"<{dropped[0].tag}>"),
+        f"MuJoCo does not read {tags} of a URDF: what is said there of friction, stiffness, "
+        "damping or motors has no effect",
+        "the same in MJCF, which mujoco.MjSpec.from_file(FILE).to_xml() makes of the file",
+    )
+
+
 # Rules for the start of a run
 
-AT_ONCE = (unit_faults, pump_faults, strongest_motor, angle_faults, friction_faults)
+AT_ONCE = (unit_faults, pump_faults, strongest_motor, angle_faults, friction_faults, urdf_faults)
 """Rules on faults that are felt from the first second, and seen without a motion."""
 
 
