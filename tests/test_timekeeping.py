@@ -604,6 +604,30 @@ def test_the_handle_slips_until_a_late_tick_is_paid(
     assert moved[0] - moved[1] == pytest.approx(lost, rel=0.3)
 
 
+class WrappingDevice(AnsweringDevice):
+    """A hand of 0.2 N behind an encoder of 10 bits and 5 µm, which wraps each 5.12 mm."""
+
+    def __init__(self) -> None:
+        super().__init__(lambda _, force: (0.2 + force) / 2.0, damping=2.0, delay=0.0)
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        result = super().read(sample)
+        sample["position"][0, 0] = (self._place + 2.56e-3) % 5.12e-3 - 2.56e-3
+        return result
+
+
+def test_a_device_that_jumps_is_not_put_down_to_the_scene(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    summary = recorded(path, "point_mass", WrappingDevice(), duration=2.0)
+    ticks = read_recording(path).ticks
+    far = [np.abs(np.diff(ticks[f"{part}_position"][:, 0])).max() for part in ("device", "tool")]
+    assert far[0] > 5e-3 > 5 * far[1]
+    assert summary.is_certified is False
+    assert timekeeping.TOO_FAR in str(summary)
+    assert "scene" not in timekeeping.TOO_FAR
+    assert "check the device for jumps of its pose" in str(summary)
+
+
 FLUNG = """
 <mujoco>
   <option gravity="0 0 0"/>
@@ -649,4 +673,6 @@ def test_a_flung_tool_is_no_matter_of_time_or_of_a_scene_that_creates(
         assert "late" not in text
     # with a microsecond of lateness, as on any clock, it is one of the causes
     real = replace(kept, mean_jitter=1e-6).fault
-    assert "late samples and forces, or a tool that moved or turned far within a tick," in real
+    assert (
+        "late samples and forces, or a tool that moved far from its handle within a tick," in real
+    )

@@ -40,7 +40,7 @@ from hapticbridge.units import format_number, format_si
 
 NOT_KEPT = "the run did not keep its time"
 SCENE_BEHIND = "behind the device's delay the scene created energy"
-TOO_FAR = "the scene moved or turned the tool too far within a tick"
+TOO_FAR = "tool and handle moved or turned too far from each other within a tick"
 """Words that name the fault of a run; the last where all was in time and no delay
 hides what the scene creates."""
 
@@ -391,8 +391,8 @@ class Timekeeping:
             )
         if self.cause == TOO_FAR:
             return (
-                f"{TOO_FAR}, and the wrench of that tick may have given the hand {given}; try less "
-                "force of what pushes the tool"
+                f"{TOO_FAR}, and the wrench of that tick may have given the hand {given}; check "
+                "the device for jumps of its pose, or try less force of what pushes the tool"
             )
         at_times = (
             f"at {format_number(self.rate)} Hz{f' ({self._late})' if self._late else ''} it would "
@@ -408,7 +408,9 @@ class Timekeeping:
                 f"{usual.available:.3g}"
             )
         else:
-            givers = "late samples and forces, or a tool that moved or turned far within a tick,"
+            givers = (
+                "late samples and forces, or a tool that moved far from its handle within a tick,"
+            )
             givers += " and the scene behind the delay," * self._has_created_behind
             reason = f"{givers} may have given the hand {given}"
         if self.silence and self.share >= MANY_KEPT and not self.sample_rate:
